@@ -17,10 +17,10 @@ from itertools import combinations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import OFF
-from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.model.unscented import root, solve_lower, unit
 
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
@@ -109,28 +109,37 @@ def mixture(
         (n, k). Where a lens is held its last column is how far the mean over all models is from what is
         reported, see `parts`.
     """
+    if not every:
+        return np.zeros(len(S)), S
     held = [name for name, block in every.items() if block.held]
-    roots, shifts, reported, shares = [], [], [], []
+    zeros = _Zeros.of(S, every)
+    ways, shifts, reported, shares, surely = [], [], [], [], set(every)
     for true, p in weights.items():
         if p < _NEGLIGIBLE:
             continue
-        given, d = _given(S, every, true)
-        roots.append(given)
-        shifts.append(d)
-        reported.append(_given(S, every, {*true, *held}, exactly=held)[1] if held else d)
+        surely &= set(true)
+        U, shift = zeros.given(true)
+        ways.append(U)
+        shifts.append(shift)
+        if held:
+            reported.append(zeros.given({*true, *held}, exactly=held)[1])
         shares.append(p)
-    if len(shares) == 1 and not held:
-        return -shifts[0], roots[0]
-    share, d = np.array(shares) / sum(shares), np.array(shifts)
+    share, d = np.array(shares) / sum(shares), np.array(shifts) @ S.T
     mean = share @ d
-    columns = [np.sqrt(p) * given for p, given in zip(shares, roots, strict=True)]
-    columns.append((np.sqrt(share / factor)[:, None] * (d - mean)).T)  # of the reported covariance
+    taken = [p * (2.0 * U - (U @ U.T) @ U) for p, U in zip(shares, ways, strict=True)]
+    M = sum(shares) * unit(ways[0].shape[1]) - np.concatenate(ways).T @ np.concatenate(taken)
+    mixed = S @ root(M + RIDGE * unit(len(M)))[: S.shape[1]]
+    for name in surely:
+        if not every[name].stated.any():
+            mixed[every[name].where] = 0.0
+    apart = (np.sqrt(share / factor)[:, None] * (d - mean)).T  # of the reported covariance
+    columns = np.concatenate([mixed, apart], axis=1)
     if not held:
-        return -mean, np.concatenate(columns, axis=1)
-    shown = share @ np.array(reported)
+        return -mean, columns
+    shown = share @ (np.array(reported) @ S.T)
     for name in held:
         shown[every[name].where] = every[name].values
-    return -shown, joined(np.concatenate(columns, axis=1), shown - mean, factor)
+    return -shown, joined(columns, shown - mean, factor)
 
 
 def joined(S: FloatArray, apart: FloatArray, factor: float) -> FloatArray:
@@ -229,36 +238,57 @@ def posterior(
     return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
 
 
-def _given(
-    S: FloatArray, every: Mapping[str, Block], true: Collection[str], exactly: Collection[str] = ()
-) -> tuple[FloatArray, FloatArray]:
-    """Square root of the covariance given that some blocks are as specified, and the mean's step, negated.
+@dataclass(frozen=True, slots=True)
+class _Zeros:
+    """A Gaussian conditioned on blocks that are as specified.
 
     With E the rows of these blocks, R the noise with which they are said to be zero, L L' = E S S' E' + R and
     U = L^-1 [E S, R^1/2], that takes [S 0] U' U [S 0]' off P and moves the mean by -d, d = [S 0] U' L^-1 x.
+    The covariance over all models is [S 0] M [S 0]', M = sum p (I - U' U)^2 = sum p (I - U' (2 I - U U') U).
+    Without the square, which changes nothing but rounding, M may have negative eigenvalues.
 
-    Args:
-        S: Square root of the covariance, shape (n, m).
-        every: All blocks.
-        true: Those that are as specified.
-        exactly: Those of them that are exactly zero, whatever their stated sigma.
+    Attributes:
+        places: Of each block among the rows of all blocks.
+        noise: Of all blocks, shape (k,).
+        rows: [E S, R^1/2] of all blocks, and their values; of R^1/2 the columns that are not zero; shape
+            (k, m + q + 1).
+        own: E S S' E' of all blocks, shape (k, k).
+        columns: m.
     """
-    n = len(S)
-    if not true:
-        return S, np.zeros(n)
-    given = [every[name] for name in every if name in true]
-    rows = np.concatenate([S[b.where] for b in given])
-    noise = np.concatenate(
-        [np.zeros(len(every[k].values)) if k in exactly else every[k].noise for k in every if k in true]
-    )
-    if noise.any():
-        rows = np.concatenate([rows, np.diag(noise)], axis=1)
-        S = np.concatenate([S, np.zeros((n, len(noise)))], axis=1)
-    L = root(rows @ rows.T)
-    U = solve_lower(L, rows)
-    d = S @ (U.T @ solve_lower(L, np.concatenate([b.values for b in given])))
-    S = S - (S @ U.T) @ U
-    for block in given:
-        if not block.stated.any():
-            S[block.where] = 0.0
-    return S, np.asarray(d)
+
+    places: dict[str, IntArray]
+    noise: FloatArray
+    rows: FloatArray
+    own: FloatArray
+    columns: int
+
+    @classmethod
+    def of(cls, S: FloatArray, every: Mapping[str, Block]) -> _Zeros:
+        """Prepare the blocks of a square root of a covariance, shape (n, m)."""
+        blocks = every.values()
+        E = np.concatenate([S[b.where] for b in blocks])
+        values = np.concatenate([b.values for b in blocks])
+        noise = np.concatenate([b.noise for b in blocks])
+        ends = np.cumsum([len(b.values) for b in blocks])
+        places = {
+            name: np.arange(end - len(b.values), end)
+            for (name, b), end in zip(every.items(), ends, strict=True)
+        }
+        R = np.diag(noise)[:, noise > 0.0]
+        return cls(places, noise, np.concatenate([E, R, values[:, None]], axis=1), E @ E.T, S.shape[1])
+
+    def given(self, true: Collection[str], exactly: Collection[str] = ()) -> tuple[FloatArray, FloatArray]:
+        """U, shape (j, m + q), and U' L^-1 x, shape (m,), where some blocks are as specified.
+
+        Args:
+            true: These.
+            exactly: Those of them that are exactly zero, whatever their stated sigma.
+        """
+        if not true:
+            return self.rows[:0, :-1], np.zeros(self.columns)
+        at = np.concatenate([self.places[name] for name in self.places if name in true])
+        noise = self.noise.copy()
+        for name in exactly:
+            noise[self.places[name]] = 0.0
+        U = solve_lower(root(self.own[at[:, None], at] + np.diag(noise[at] ** 2)), self.rows[at])
+        return U[:, :-1], U[:, : self.columns].T @ U[:, -1]

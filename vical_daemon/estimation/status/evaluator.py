@@ -122,8 +122,8 @@ class Evaluator:
 
     def nis_per_dof(self) -> float:
         """Consistency: mean of normalised squares per degree of freedom; 1 when consistent."""
-        dof = sum(n for _, n in self._squares)
-        return sum(s for s, _ in self._squares) / dof if dof else 0.0
+        square, dof = map(sum, zip(*self._squares, strict=True)) if self._squares else (0.0, 0)
+        return square / dof if dof else 0.0
 
     def _announce_jitter(self, camera: str, jitter_s: float, cause: Cause = Cause.NONE) -> None:
         if jitter_s >= ANNOUNCED_S:

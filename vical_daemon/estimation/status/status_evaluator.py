@@ -175,9 +175,8 @@ class StatusEvaluator(Evaluator):
         return clock_drift.averaged(f)
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
-        square = self._residuals.get(name, ())
-        count = sum(n for _, n in square)
-        rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
+        square, count = map(sum, zip(*self._residuals.get(name) or [(0.0, 0)], strict=True))
+        rms = float(np.sqrt(square / count)) if count else 0.0
         return camera_estimate(f, name, rms)
 
     def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[WeakDirection]:
