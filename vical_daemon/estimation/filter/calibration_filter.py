@@ -328,8 +328,9 @@ class CalibrationFilter:
         information, shared = ways[:, :6].T @ ways[:, :6], self.shared.get(image.camera)
         if shared is not None:  # what corners share is noise, too
             alike = ways @ (by_shared * shared.sigmas)
-            across = ways[:, :6].T @ alike
-            information -= across @ np.linalg.solve(unscented.unit(WAYS) + alike.T @ alike, across.T)
+            L = unscented.root(unscented.unit(WAYS) + alike.T @ alike)
+            known = unscented.solve_lower(L, alike.T @ ways[:, :6])
+            information -= known.T @ known
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
         return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)

@@ -91,7 +91,7 @@ def strapdown(
     dR = products(rotation_steps(omega, dt, turn_slope))
     f_start = np.matmul(dR, force[..., None])[..., 0]
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
-    dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
+    dv, dp = np.zeros((2, *f_start.shape))
     gained = (before + after) * (0.5 * h)
     moved = (2.0 * before + after) * (h * h / 6.0)
     if force_slope is not None:

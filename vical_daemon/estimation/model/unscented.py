@@ -102,7 +102,7 @@ def lower_root_grown(A: FloatArray, columns: FloatArray, d: int) -> FloatArray:
         d: Number of leading rows.
     """
     R = upper_root(np.concatenate([A[:, :d], columns], axis=1).T)
-    L = np.zeros_like(A)
+    L = np.zeros(A.shape)
     L[:, :d] = R[:d].T * np.where(R.diagonal()[:d] < 0.0, -1.0, 1.0)
     L[d:, d:] = lower_root(np.concatenate([A[d:, d:], R[d:, d:].T], axis=1))
     return L
