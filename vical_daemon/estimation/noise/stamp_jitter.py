@@ -15,6 +15,9 @@ FLOOR_S = 2e-5  # of a jitter that is one
 _ROUNDS = 8
 ANNOUNCED_S = 3e-4
 """From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
+PERSISTENT = 0.5
+"""Correlation of what neighbouring images are late by: nearer to that of a model error (1) than to that of a
+jitter (0)."""
 
 
 def excess(square: FloatArray, usual: FloatArray) -> float:

@@ -341,7 +341,9 @@ class Bundle:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
-        inertial, jitter_s = links_left(w, now.links, self.problem.noise.jitter_s, order, np.tril(root))
+        inertial, jitter_s, alike = links_left(
+            w, now.links, self.problem.noise.jitter_s, order, np.tril(root)
+        )
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
@@ -350,7 +352,7 @@ class Bundle:
             squares,
             max(self._dof(seen), 1),
             inertial,
-            self.problem.noise._replace(jitter_s=jitter_s),
+            self.problem.noise._replace(jitter_s=jitter_s, alike=alike),
             steps,
             settled,
             int(good.sum()),

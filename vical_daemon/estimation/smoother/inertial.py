@@ -127,8 +127,8 @@ def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> flo
 
 def links_left(
     window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, root: FloatArray
-) -> tuple[float, float]:
-    """Mean squared error of the links, and the jitter of the stamps that they show, s.
+) -> tuple[float, float, float]:
+    """Mean squared error of the links, the jitter of the stamps that they show, s, and how alike it is.
 
     Args:
         window: Adjusted.
@@ -139,8 +139,8 @@ def links_left(
     """
     e, J = link_errors(window, links)
     if not jitter_s:
-        return float((e**2).mean()), 0.0
+        return float((e**2).mean()), 0.0, 0.0
     late = StampOffsets(window, e, J, jitter_s)
     shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
     left = (float((e**2).sum()) - late.explained()) / e.size
-    return left, shown_s if shown_s > FLOOR_S else 0.0
+    return left, shown_s if shown_s > FLOOR_S else 0.0, late.alike()

@@ -56,6 +56,11 @@ class StampOffsets:
         inverse = cho_solve((self._root, True), np.eye(len(self._root)))
         return -inverse @ self._right, inverse.diagonal().copy()
 
+    def alike(self) -> float:
+        """Correlation of the delays of neighbouring images: 0 of a jitter, near 1 if the time shift has changed."""
+        tau = self.delays()[0]
+        return float(tau[1:] @ tau[:-1] / (tau @ tau))
+
     def by_states(self, J: FloatArray, at: IntArray, size: int) -> FloatArray:
         """B'J over all states, shape (F, size); `at` (F - 1, c): where the columns of J live."""
         G = np.zeros((len(self._root), size))

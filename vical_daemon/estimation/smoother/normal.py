@@ -86,12 +86,14 @@ class ImageNoise(NamedTuple):
         spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
         jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
         lens_px: Misfit of the lens model, see `lens_misfit`, px.
+        alike: Correlation of what the stamps of neighbouring images are off by, as measured.
     """
 
     sigma_px: float
     spread: float = 1.0
     jitter_s: float = 0.0
     lens_px: float = SYSTEMATIC_PX
+    alike: float = 0.0
 
 
 class Problem:

@@ -13,6 +13,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_misfit import WINDOWS
+from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
@@ -176,6 +177,8 @@ class TargetFreeStatus(Evaluator):
             self.misfit = Cause.INERTIAL_MISFIT, float(fit.inertial)
         elif share > _MOST_REFUSED:
             self.misfit = Cause.SCENE_MOVES, float(share)
+        elif self._windows and fit.noise.jitter_s > ANNOUNCED_S and fit.noise.alike > PERSISTENT:
+            self.misfit = Cause.WINDOW_CONTRADICTED, 0.0  # no jitter: the time shift has changed
         return not self.misfit[0]
 
     def saw_fit(self, fit: Fit, t_s: float) -> None:

@@ -302,6 +302,27 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
     np.testing.assert_allclose(delays.delays()[0], wanted, atol=3e-3 * np.abs(wanted).max())
 
 
+@pytest.mark.parametrize("case", ["step", "jitter"])
+def test_images_that_are_late_alike_are_no_jitter(scene, case):
+    window = scene.window()
+    links, knots = window.stacked(), window.knots()
+    rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
+    count = len(window.frames)
+    late = 1e-3 * np.random.default_rng(8).standard_normal((count, 1))
+    if case == "step":
+        late = np.where(np.arange(count) < count // 2, -1e-3, 1e-3)[:, None]
+    right = links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)[0]
+    e, J = links.errors(
+        window.R @ so3.exp(-late * rates),
+        window.p - late * window.v,
+        window.v - late * push,
+        window.bias[knots],
+        window.gravity,
+    )
+    alike = StampOffsets(window, e - right, J, 1e-3).alike()
+    assert alike > 0.8 if case == "step" else abs(alike) < 0.4
+
+
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     window = scene.window()
     layout = POSE_AND_CLOCK
