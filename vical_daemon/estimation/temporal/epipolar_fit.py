@@ -40,6 +40,7 @@ _DISTORTION_SIGMA = {
     "plumb_bob": (0.1, 0.1, 0.005, 0.005, 0.1),
     "equidistant": (0.05, 0.05, 0.05, 0.05),
 }
+_LENS_AFTER = 4  # iterations with the lens as given
 _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
@@ -179,9 +180,9 @@ class _Fit:
             spread = sigma_by_median(e[self.ok]) + 1e-9
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, geman_mcclure_weight((e / (k * spread)) ** 2), 0.0)
-            size = J.shape[1]
-            H, g, each = self._normal(e, J, Jt, weight / spread**2)
-            if size > 7 and step == 0:
+            size = 7 if step < _LENS_AFTER else J.shape[1]  # first with the lens as given
+            H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
+            if size > 7 and step == _LENS_AFTER:
                 self.lasting = self._errors_last(H, each)
             if size > 7:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
@@ -197,7 +198,7 @@ class _Fit:
                 self._rays()
                 if self.ok.mean() < _LEAST_RAYS:
                     return None  # the lens has run away
-            if step > 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
+            if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
                 break
         return self._result(R, shift, bias, weight)
 
