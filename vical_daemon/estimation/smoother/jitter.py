@@ -57,7 +57,7 @@ class StampOffsets:
         return -inverse @ self._right, inverse.diagonal().copy()
 
     def alike(self) -> float:
-        """Correlation of the delays of neighbouring images: 0 for jitter, near 1 if the time shift changed."""
+        """Correlation of neighbouring delays: 0 for jitter, near 1 if the time shift has changed."""
         tau = self.delays()[0]
         return float(tau[1:] @ tau[:-1] / (tau @ tau))
 
