@@ -283,8 +283,8 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
 def test_a_failure_is_one_line_and_keeps_an_earlier_result(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    """A board 23 times too large, as if only up to ten times were believed: the accelerometer shows it."""
-    monkeypatch.setattr("vical_daemon.estimation.init.velocity_gravity_init._SIZES", (0.1, 10.0))
+    """A board 23 times too large, as if no other size were tried: the accelerometer shows it."""
+    monkeypatch.setattr("vical_daemon.estimation.init.velocity_gravity_init._other_size", lambda *_: None)
     earlier = copy / "result.json"
     earlier.write_text("of yesterday", encoding="utf-8")
     assert main([*_with_tag_size(copy, 2.0), "-o", str(earlier)]) == 1

@@ -81,7 +81,7 @@ class CalibrationFilter:
         shared: Measured errors that the corners of an image share, by camera.
         unobservable: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        wandered: When their drift was last found to be another, s, and its value, s/s.
+        wandered: When their drift was found to be another, s, and its values, s/s.
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
@@ -104,7 +104,7 @@ class CalibrationFilter:
     shared: dict[str, SharedErrors] = field(default_factory=dict)
     unobservable: UnobservableDirections | None = None
     drifting: set[str] = field(default_factory=set)
-    wandered: dict[str, tuple[float, float]] = field(default_factory=dict)
+    wandered: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0

@@ -98,10 +98,10 @@ def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
     f.walk[where.skew] = max(f.walk[where.skew], SKEW_WALK**2)
     if anew:
         t_s, skew = f.state.t_s, f.state.cameras[camera].skew
-        if camera in f.wandered:  # no crystal: an exposure that adapts to the light, a network
-            before_s, before = f.wandered[camera]
-            f.walk[where.skew] = max(f.walk[where.skew], (skew - before) ** 2 / (t_s - before_s))
-        f.wandered[camera] = t_s, skew
+        earlier = f.wandered.setdefault(camera, [])  # any: no crystal, but auto-exposure or a network
+        walks = [(skew - before) ** 2 / (t_s - before_s) for before_s, before in earlier]
+        f.walk[where.skew] = max(f.walk[where.skew], *walks, 0.0)
+        earlier.append((t_s, skew))
         f.reopen(where.skew, SKEW_SIGMA)
         f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
     kind = EventKind.CLOCK_WANDER if anew else EventKind.CLOCK_DRIFT

@@ -111,7 +111,8 @@ class ChangeWatch:
         skew, factor = f.state.cameras[camera].skew, f.consistency[camera].factor
         changes = watch.drifts(t_s, skew, variance, factor, walk)
         begins = camera not in f.drifting and surely_apart(f, camera)
-        if changes or (begins and watch.doubtful):
+        wanders = len(f.wandered.get(camera, ())) > 1
+        if changes or ((begins or wanders) and watch.doubtful):
             self._drift.pop(camera)
             return Action.WANDER
         return Action.SKEW if begins else Action.NONE

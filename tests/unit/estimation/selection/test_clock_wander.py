@@ -20,7 +20,7 @@ def wander_s(t_s: float) -> float:
     return SIZE_S * float(np.sin(2.0 * np.pi * t_s / PERIOD_S))
 
 
-@pytest.mark.parametrize("seed", [41, 42])
+@pytest.mark.parametrize("seed", [41, 43, 44])
 def test_an_exposure_that_adapts_to_the_light(seed: int) -> None:
     run = simulate(seed, 30.0)
     late = [replace(f, t_cam_ns=f.t_cam_ns + round(1e9 * wander_s(f.t_s))) for f in run.frames]
@@ -31,7 +31,7 @@ def test_an_exposure_that_adapts_to_the_light(seed: int) -> None:
     assert EventKind.CLOCK_WANDER in kinds and EventKind.BUMPED not in kinds
     z = [(s.error[6] + wander_s(s.t_s)) / np.sqrt(s.covariance[6, 6]) for s in record.snapshots]
     shown = [abs(x) for x, s in zip(z, record.snapshots, strict=True) if s.t_s > 18.0]
-    assert np.sqrt(np.mean(np.square(shown))) < 3.0 and max(shown) < 5.0  # 6.1 to 7.0 and 15 without
+    assert np.sqrt(np.mean(np.square(shown))) < 2.0 and max(shown) < 4.0  # 6.1 to 7.0 and 15 without
 
 
 def test_what_a_walk_explains_is_no_other_drift() -> None:
