@@ -22,6 +22,7 @@ from vical_mocks.harness.feed import (
     nees,
     points_frame,
 )
+from vical_mocks.harness.recordings import Items, read
 from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import BiasWalk, Rig, nominal_gravity, reference_rig
 from vical_mocks.rotations import exp_so3, log_so3
@@ -112,7 +113,7 @@ def euroc() -> None:
     if not folder.is_dir():
         print(f"no recording at {folder}", file=sys.stderr)
         return
-    items, points = euroc_halves.read(folder), load_target(folder / "target.yaml").points_m
+    items, points = read(folder), load_target(folder / "target.yaml").points_m
     split = items[0][0] + int(euroc_halves.SPLIT_S * 1e9)
     halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
     print(
@@ -126,9 +127,7 @@ def euroc() -> None:
             print(f"| {lens} | {order} | {_difference(whole, as_one(parts, options, points))} |", flush=True)
 
 
-def as_one(
-    parts: Sequence[euroc_halves.Items], options: CalibrationOptions, points: np.ndarray
-) -> CameraEstimate:
+def as_one(parts: Sequence[Items], options: CalibrationOptions, points: np.ndarray) -> CameraEstimate:
     """Calibrate stretches of EuRoC's recording as recordings of one rig."""
     subject = CalibratorSubject(options, euroc_halves.PRIOR, points)
     for number, part in enumerate(parts):
