@@ -2,8 +2,8 @@
 
     python examples/plain_zenoh.py [ENDPOINT]      # default: the service on this computer, for its group
 
-Payloads are ROS 2 messages in CDR; the pose comes as geometry_msgs/PoseWithCovarianceStamped beside our
-own, richer message.
+Payloads are ROS 2 messages in CDR; the pose comes as geometry_msgs/PoseWithCovarianceStamped, in
+addition to our own, richer message.
 """
 
 from __future__ import annotations

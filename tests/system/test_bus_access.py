@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -21,6 +22,7 @@ from vical_daemon.bus.local_bus import open_local_bus
 from vical_daemon.bus.messages import encode_string
 from vical_daemon.bus.socket_paths import Reach, local_sockets, reach, why_closed
 from vical_daemon.bus.zenoh_bus import BusError, open_bus
+from vical_daemon.bus.zenoh_commands import CommandJournal
 from vical_daemon.cli.bus_access import open_client, open_for_roles
 from vical_daemon.config.model import BusConfig, Config
 
@@ -253,6 +255,19 @@ def test_every_command_is_journalled_with_its_origin(tmp_path, caplog):
         assert len(journalled()) < 100
     for each in (group, boss, bus):
         each.close()
+
+
+def test_a_command_of_a_sender_that_has_left_is_not_taken_for_a_foreign_one(caplog):
+    info = SimpleNamespace(zid=lambda: "aa", links=list)
+    session = SimpleNamespace(info=info, declare_subscriber=lambda _key, _take: None)
+    stamp = SimpleNamespace(get_id=lambda: "bb")
+    received = SimpleNamespace(
+        key_expr=COMMAND, timestamp=stamp, payload=SimpleNamespace(to_bytes=lambda: encode_string("stop"))
+    )
+    with caplog.at_level(logging.INFO):
+        CommandJournal(session)._take(received)
+    text = "'stop', from zenoh id bb, its link is closed by now or leads through another router"
+    assert caplog.messages[-1].endswith(text)
 
 
 def test_a_password_that_would_shut_out_our_own_processes_is_refused(tmp_path):

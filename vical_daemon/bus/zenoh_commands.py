@@ -51,7 +51,7 @@ class CommandJournal:
             return f"this process, or a session that does not say who it is (zenoh id {sender})"
         links = [link for link in self._session.info.links() if str(link.zid) == sender]
         if not links:
-            return f"zenoh id {sender}, behind another router"
+            return f"zenoh id {sender}, its link is closed by now or leads through another router"
         protocol, _, place = str(links[0].dst).partition("/")
         way = "unix socket" if protocol == "unixsock-stream" else f"{protocol} {place}"
         user = links[0].auth_identifier

@@ -26,6 +26,7 @@ WORDS = {  # role and word on the bus
     "record-stop": ("record", "stop"),
 }
 _ANSWERED = ("accept", "discard")
+_OF_VERIFY = ("check", "calibrate", "verify")  # have an effect only with `mode: verify`
 _BUS_S = 3.0
 _ANSWER_S = 5.0  # estimates come five times a second, also from a busy machine
 _EPILOG = """\
@@ -37,7 +38,7 @@ _EPILOG = """\
   vical command verify            ends such a calibration
   vical command record-start      begin a recording (record-stop ends it)
 
-exit code: 0 done; 1 no answer, or the result was refused; 2 bad usage
+exit code: 0 done; 1 no answer, the result was refused, or the command has no effect in this mode; 2 bad usage
 """
 
 
@@ -86,11 +87,12 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
         answer_s: How long to wait for an answer, s.
 
     Raises:
-        CliError: No answer came.
+        CliError: No answer came, or the command has no effect on what the rig does now.
     """
     from vical_daemon.bus import topics
     from vical_daemon.bus.messages import encode_string
 
+    _check_effect(bus, rig, word)
     answers: list[str] = []
     came = threading.Event()
 
@@ -111,6 +113,29 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
     finally:
         subscription.close()
     return answers[0]
+
+
+def _check_effect(bus: Bus, rig: str, word: str) -> None:
+    """Refuse a command that the role estimate ignores: each mode has its own.
+
+    Raises:
+        CliError: The command has no effect now.
+    """
+    from vical_daemon.bus import topics
+    from vical_daemon.bus.messages import CheckState, decode_verification
+
+    role, _ = WORDS[word]
+    if role != "estimate" or not bus.latest(topics.STATUS.key(rig, role)):
+        return
+    samples = bus.latest(topics.VERIFY.key(rig, "x").replace("/x/", "/*/"))
+    if word in _OF_VERIFY:
+        if not samples:
+            raise CliError(f"`{word}` has no effect on {rig}: it needs `mode: verify` in the config")
+    elif any(decode_verification(sample.payload).state is not CheckState.CALIBRATING for sample in samples):
+        raise CliError(
+            f"`{word}` has no effect on {rig}, which verifies its calibration (`mode: verify`): "
+            "first `vical command calibrate`"
+        )
 
 
 def _answer(sample: Sample) -> str:

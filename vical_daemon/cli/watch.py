@@ -70,11 +70,12 @@ def _loop(args: argparse.Namespace, view: View, end_s: float) -> int:
         while time.monotonic() < end_s:
             if args.once and view.estimates:
                 break
-            if args.until_converged and view.all_converged():
-                return 0
+            converged = args.until_converged and view.all_converged()
             if not args.once:
                 view.print_new()
             show(view)
+            if converged:  # its estimate has been printed
+                return 0
             time.sleep(_REFRESH_S)
     if args.once:
         view.print_all()

@@ -9,12 +9,15 @@ import pytest
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import (
+    CheckState,
     DiagnosticStatus,
     Level,
+    VerifyResult,
     decode_calibration,
     encode_diagnostics,
     encode_imu,
     encode_string,
+    encode_verification,
 )
 from vical_daemon.calibrate import role as estimate
 from vical_daemon.cli import command
@@ -126,3 +129,31 @@ def test_a_command_without_anybody_who_listens_says_so():
     with pytest.raises(CliError, match="no answer from rig0"):
         command.send(LocalBus(), "rig0", "accept", 0.05)
     assert command.send(LocalBus(), "rig0", "record-start") == "sent: record-start to rig0"
+
+
+@pytest.mark.parametrize("word", ["check", "calibrate", "verify"])
+def test_commands_of_the_other_mode_are_refused_while_calibrating(running, word):
+    running.until(lambda: running.bus.latest(topics.STATUS.key("rig0", "estimate")))
+    with pytest.raises(CliError, match=f"`{word}` has no effect on rig0: it needs `mode: verify`"):
+        command.send(running.bus, "rig0", word)
+
+
+@pytest.mark.parametrize("word", ["accept", "discard", "reset"])
+def test_commands_of_the_other_mode_are_refused_while_verifying(word):
+    bus = LocalBus()
+    status = [DiagnosticStatus(Level.OK, "estimate", "verify: resting")]
+    bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(1, "estimate", status))
+    commands = bus.subscribe(topics.COMMAND.key("rig0", "estimate"), depth=8)
+
+    def enter(state: CheckState) -> None:
+        payload = encode_verification(VerifyResult(1, "cam0", state))
+        bus.publish(topics.VERIFY.key("rig0", "cam0"), payload)
+
+    enter(CheckState.RESTING)
+    with pytest.raises(CliError, match=f"`{word}` has no effect on rig0, which verifies"):
+        command.send(bus, "rig0", word)
+    assert commands.recv(0.0) is None
+    enter(CheckState.CALIBRATING)  # the estimator runs, and takes them
+    with contextlib.suppress(CliError):  # nobody answers here
+        command.send(bus, "rig0", word, 0.05)
+    assert commands.recv(0.0) is not None

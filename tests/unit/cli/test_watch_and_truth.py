@@ -82,6 +82,7 @@ def test_until_converged_waits_for_every_camera_of_the_rig(bus: LocalBus, capsys
     lines = capsys.readouterr().out.splitlines()
     assert all(line.startswith("rover") for line in lines)
     assert "shift -12.50 ± 0.10 ms" in lines[0] and "turn about x" in lines[0]
+    assert "converging" in lines[0] and " converged " in lines[-1]
 
 
 def test_out_of_time_exits_1_and_says_where_it_stands(bus: LocalBus, capsys) -> None:
