@@ -253,3 +253,11 @@ def test_two_cameras_on_one_imu_are_estimated_together(run):
     )
     gap = np.array(cameras["cam1"].T_imu_cam.p_m) - cameras["cam0"].T_imu_cam.p_m
     assert np.linalg.norm(gap) < 4e-3
+
+
+def test_a_camera_without_images_is_named(run):
+    """All cameras start together: otherwise nobody would know what is waited for."""
+    both = {**prior(run), "cam1": prior(run)["cam0"]}
+    estimate = calibrate(run, cameras=both).estimate()
+    assert estimate.status is Status.INITIALISING
+    assert estimate.reason == "cam1: target not in view yet; all cameras start together"

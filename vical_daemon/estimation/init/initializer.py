@@ -128,9 +128,12 @@ class Initializer:
             size: Of the target as it is taken to be, over the one in its file.
             may_resize: The closed form may suggest another size.
         """
-        if self._too_short:
+        short = self._too_short()
+        if short:
             if self._rests:
                 return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
+            if len(short) < len(self._frames):
+                return _none(f"{', '.join(short)}: target not in view yet; all cameras start together")
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)
@@ -154,11 +157,10 @@ class Initializer:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
         return Attempt(found.filter, frames, result.reason)
 
-    @property
-    def _too_short(self) -> bool:
-        """Whether some camera has not seen enough yet."""
-        spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
-        return len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S
+    def _too_short(self) -> list[str]:
+        """Return the cameras that have not seen enough yet."""
+        seen = self._frames.items()
+        return [name for name, f in seen if len(f) < 2 or f[-1][0] - f[0][0] < _MIN_SPAN_S]
 
     def _may_look(self) -> bool:
         """Whether enough is new to look for a rolling shutter once more."""
