@@ -20,7 +20,7 @@ def wander_s(t_s: float) -> float:
     return SIZE_S * float(np.sin(2.0 * np.pi * t_s / PERIOD_S))
 
 
-@pytest.mark.parametrize("seed", [41, 43, 44])
+@pytest.mark.parametrize("seed", [41, 42, 43, 44])
 def test_an_exposure_that_adapts_to_the_light(seed: int) -> None:
     run = simulate(seed, 30.0)
     late = [replace(f, t_cam_ns=f.t_cam_ns + round(1e9 * wander_s(f.t_s))) for f in run.frames]
