@@ -151,7 +151,7 @@ def test_euroc_published_calibration_is_found_wrong(capsys):
     document = json.loads(out)
     assert code == 4
     assert document["verdict"] == "changed"
-    assert document["seconds_used"] < 30.0
+    assert document["seconds_used"] < 20.0
     assert document["probability_changed"] > 0.98  # odds of 1000 and a prior of 5 %
 
 

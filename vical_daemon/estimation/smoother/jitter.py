@@ -59,7 +59,8 @@ class StampOffsets:
     def alike(self) -> float:
         """Correlation of neighbouring delays: 0 for jitter, near 1 if the time shift has changed."""
         tau = self.delays()[0]
-        return float(tau[1:] @ tau[:-1] / (tau @ tau))
+        size = float(tau @ tau)
+        return float(tau[1:] @ tau[:-1]) / size if size else 0.0  # 0: at rest nothing shows delays
 
     def by_states(self, J: FloatArray, at: IntArray, size: int) -> FloatArray:
         """B'J over all states, shape (F, size); `at` (F - 1, c): where the columns of J live."""
