@@ -7,11 +7,10 @@ short lag (so that inertial data always bracket each image) -> `evaluator` says 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
@@ -46,7 +45,6 @@ _KEEP_S = 5.0
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
-_MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 
 
 class Calibrator:
@@ -68,7 +66,7 @@ class Calibrator:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")
         self.options = options
         self.rig = RigModel(options, cameras, np.asarray(target_points_m, dtype=np.float64))
-        self.evaluator = StatusEvaluator(options, self.rig.layout)
+        self.evaluator = StatusEvaluator(options)
         self.filter: CalibrationFilter | None = None
         self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
@@ -88,8 +86,7 @@ class Calibrator:
 
     def _new_initializer(self, off: Collection[str] = ()) -> Initializer:
         """For a rig of which it is known what is not as specified."""
-        options = replace(self.options, estimate=self.options.estimate | set(off))
-        return Initializer(options, self.rig.layout, self.rig.target, self._step)
+        return Initializer(self.options, self.rig, self._step, off)
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -170,7 +167,8 @@ class Calibrator:
             self._buffer.trim(self._initializer.oldest_s - _KEEP_S)
         if not (at_end or self._initializer.due(self._buffer.newest_s)):
             return
-        found = self._attempt(self._buffer)
+        found = self._initializer.attempt(self._buffer, may_be_partial=self.filter is None)
+        self.evaluator.announce_all(found.news)
         if found.filter is None:
             if self.filter is None:
                 self.evaluator.waiting(found.reason, found.motion_missing)
@@ -180,32 +178,10 @@ class Calibrator:
             self.evaluator.announce(event, once=model_selection.SIZE)
         self._begin(found.filter, found)
 
-    def _attempt(self, buffer: ImuBuffer) -> Attempt:
-        """Try to start; where the data contradict the model of the rig, change that and try again."""
-        may_be_partial, size, may_resize = self.filter is None, self.rig.size, True
-        for _ in range(_MOST_CHANGES):
-            found = self._initializer.attempt(
-                buffer,
-                self.rig.priors,
-                may_be_partial=may_be_partial,
-                size=self.rig.size,
-                may_resize=may_resize,
-            )
-            if found.rolling is not None:
-                self._estimate_readout(*found.rolling)
-            elif found.size is not None:
-                self._resize(found.size)
-                may_resize &= self.rig.size != 1.0  # the size in the file was found to fit
-            else:
-                break
-        if found.filter is None and self.rig.size != size:
-            self._resize(size)
-        return found
-
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
         """Go on from a start: use its images, and then the stream."""
         later = self._pending.take_all()
-        f.began_s, f.stamp_sigma_s = f.state.t_s, self._intake.stamp_sigma_s
+        f.stamp_sigma_s = self._intake.stamp_sigma_s
         if self._stale is not None and self._stale.layout is self.rig.layout:
             f.keep_from(self._stale)
             self._kept_until_s = f.state.t_s + _PROVEN_S
@@ -237,22 +213,6 @@ class Calibrator:
             self._note(now, report, frame, t_cam_s)
             self._reports.append(report)
         return []
-
-    def _estimate_readout(self, camera: str, axis: str) -> None:
-        """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
-        self.rig.estimate_readout(camera, axis)
-        self._rig_changed()
-        self.evaluator.announce(Event(ROLLING[axis], camera))
-
-    def _resize(self, size: float) -> None:
-        """Take the target for `size` times as large as in its file; where that is far off, estimate it."""
-        self.rig.resize(size)
-        self._rig_changed()
-
-    def _rig_changed(self) -> None:
-        self.evaluator.layout = self.rig.layout
-        off = {model_selection.SIZE} if self.rig.size != 1.0 else set()
-        self._initializer.go_on_with(self.rig.layout, self.rig.target, off)
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from vical_daemon.estimation.events import ROLLING, Event
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
@@ -15,19 +16,16 @@ from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.attempts import Attempts
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rest import RestDetector
+from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.init.velocity_gravity_init import StartResult
 from vical_daemon.estimation.init.window_start import Step, WindowStart, window_start
-from vical_daemon.estimation.measurements import (
-    CalibrationOptions,
-    CameraPrior,
-    FloatArray,
-    Frames,
-    PointsFrame,
-)
-from vical_daemon.estimation.model.state import Layout, State
+from vical_daemon.estimation.measurements import CalibrationOptions, Frames, PointsFrame
+from vical_daemon.estimation.model.state import State
+from vical_daemon.estimation.selection import model_selection
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
+_MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
@@ -44,6 +42,7 @@ class Attempt:
         motion_missing: It is motion that is missing, not time.
         rolling: See `StartResult`.
         size: The target seems to be so many times as large as in its file, and is to be taken as that large.
+        news: What was found to be not as specified.
     """
 
     filter: LinearisedFilter | None = None
@@ -52,6 +51,7 @@ class Attempt:
     motion_missing: bool = False
     rolling: tuple[str, str] | None = None
     size: float | None = None
+    news: list[Event] = field(default_factory=list)
 
 
 class Initializer:
@@ -59,15 +59,17 @@ class Initializer:
 
     Args:
         options: Switches.
-        layout: Which blocks are estimated.
-        target: Points of the target, m, shape (n, 3).
+        rig: Its model, which is changed where the data contradict it.
         step: Propagates a filter to an image and corrects it.
+        off: What is known to be not as specified, see `CalibrationFilter.off`.
     """
 
-    def __init__(self, options: CalibrationOptions, layout: Layout, target: FloatArray, step: Step) -> None:
-        self._given, self._layout, self._target, self._step = options, layout, target, step
-        self._options, self._attempts = options, Attempts(first_s=0.5)
-        self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
+    def __init__(
+        self, options: CalibrationOptions, rig: RigModel, step: Step, off: Collection[str] = ()
+    ) -> None:
+        self._options = replace(options, estimate=options.estimate | set(off))
+        self._rig, self._step, self._attempts = rig, step, Attempts(first_s=0.5)
+        self._frames: dict[str, Frames] = {name: [] for name in rig.layout.cameras}
         self.anew()
 
     def anew(self) -> None:
@@ -110,24 +112,33 @@ class Initializer:
         self._newest_s = newest_s
         return self._attempts.due(newest_s) and not (self._attempts.count and self._rests)
 
-    def attempt(
-        self,
-        buffer: ImuBuffer,
-        priors: dict[str, CameraPrior],
-        *,
-        may_be_partial: bool,
-        size: float = 1.0,
-        may_resize: bool = True,
-    ) -> Attempt:
-        """Try to start from what was seen.
+    def attempt(self, buffer: ImuBuffer, *, may_be_partial: bool) -> Attempt:
+        """Try to start; where the data contradict the model of the rig, change that and try again.
 
         Args:
             buffer: Inertial readings.
-            priors: By camera.
             may_be_partial: A start with guesses is welcome where the motion shows no more.
-            size: Of the target as it is taken to be, over the one in its file.
-            may_resize: The closed form may suggest another size.
         """
+        rig, news, may_resize = self._rig, list[Event](), True
+        size = rig.size
+        for _ in range(_MOST_CHANGES):
+            found = self._once(buffer, may_be_partial=may_be_partial, may_resize=may_resize)
+            if found.rolling is not None:  # its readout is one more unknown from now on
+                camera, axis = found.rolling
+                rig.estimate_readout(camera, axis)
+                news.append(Event(ROLLING[axis], camera))
+            elif found.size is not None:  # where that is far off, it is estimated
+                rig.resize(found.size)
+                may_resize &= rig.size != 1.0  # the size in the file was found to fit
+            else:
+                break
+        if found.filter is None and rig.size != size:
+            rig.resize(size)
+        return replace(found, news=news)
+
+    def _once(self, buffer: ImuBuffer, *, may_be_partial: bool, may_resize: bool) -> Attempt:
+        """Try to start with the model of the rig as it is; `may_resize`: another size may be suggested."""
+        rig, size = self._rig, self._rig.size
         short = self._too_short()
         if short:
             if self._rests:
@@ -137,10 +148,12 @@ class Initializer:
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)
-        noise = measured_noise(self._options.imu_noise, buffer.rows)
-        options = replace(self._options, imu_noise=noise)
+        options = self._options
+        if size != 1.0:
+            options = replace(options, estimate=options.estimate | {model_selection.SIZE})
+        options = replace(options, imu_noise=measured_noise(options.imu_noise, buffer.rows))
         data = start.StartData(
-            buffer, self._frames, priors, options, self._layout, self._target, may_resize, self._may_look()
+            buffer, self._frames, rig.priors, options, rig.layout, rig.target, may_resize, self._may_look()
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:
@@ -155,6 +168,7 @@ class Initializer:
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
+        found.filter.began_s = found.filter.state.t_s
         return Attempt(found.filter, frames, result.reason)
 
     def _too_short(self) -> list[str]:
@@ -181,13 +195,13 @@ class Initializer:
         """Adjust a window from `state` on; see `window_start`."""
         make = partial(
             initial_filter,
-            layout=self._layout,
+            layout=self._rig.layout,
             options=options,
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
         return window_start(
-            state, result.poses, frames, make, self._step, buffer, self._target, stated=stated
+            state, result.poses, frames, make, self._step, buffer, self._rig.target, stated=stated
         )
 
     def _frames_from(self, state: State) -> Frames:
@@ -200,11 +214,6 @@ class Initializer:
             if t + shifts[f.camera] > state.t_s - LATE_S
         ]
         return sorted(frames, key=lambda item: item[0] + shifts[item[1].camera])
-
-    def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
-        """Keep what was seen, for another target or with other unknowns; `off`: what seems to be off."""
-        self._layout, self._target = layout, target
-        self._options = replace(self._given, estimate=self._given.estimate | set(off))
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:

@@ -15,7 +15,6 @@ from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
@@ -38,12 +37,10 @@ class StatusEvaluator(Evaluator):
 
     Args:
         options: Switches and targets.
-        layout: Where the errors live.
     """
 
-    def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
+    def __init__(self, options: CalibrationOptions) -> None:
         super().__init__(options, "the target has not been seen yet: show the whole board to the camera", 300)
-        self.layout = layout
         self._imu_asked = "imu_intrinsics" in options.estimate
         self.frames = 0
         self.in_doubt = ""
@@ -133,7 +130,7 @@ class StatusEvaluator(Evaluator):
         f = None if f is None else self.weighed(f, shares)
         stale = None if stale is None else self.weighed(stale)
         shown = f or stale
-        cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
+        cameras = {} if shown is None else {name: self._camera(name, shown) for name in shown.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
         verdict = self._decide(f, missing)
         if f is None:
@@ -168,7 +165,7 @@ class StatusEvaluator(Evaluator):
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in self.layout.cameras)
+        drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in f.layout.cameras)
         if self.clocks_doubtful or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
         if any(x.wander_px for x in f.shared.values()):
@@ -194,7 +191,7 @@ class StatusEvaluator(Evaluator):
         return camera_estimate(f, name, rms)
 
     def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[WeakDirection]:
-        where = self.layout.cameras[name]
+        where = f.layout.cameras[name]
         if where.position is None and where.timeshift is None:
             return []
         return self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
@@ -222,7 +219,7 @@ class StatusEvaluator(Evaluator):
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """The camera whose fixed lens is the only reason why something is missing; empty: there is none."""
-        cameras = {name: lens_known(self._camera(name, f)) for name in self.layout.held}
+        cameras = {name: lens_known(self._camera(name, f)) for name in f.layout.held}
         if not cameras or any(self._missing(e, name, f) for name, e in cameras.items()):
             return ""
         return max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))

@@ -6,8 +6,8 @@ from vical_mocks.points import board_points
 
 from vical_daemon.estimation.init.initializer import Initializer
 from vical_daemon.estimation.init.rest import RestDetector
-from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
-from vical_daemon.estimation.model.state import make_layout
+from vical_daemon.estimation.init.rig_model import RigModel
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 
 F_PX = 500.0
 RATE_HZ = 20.0
@@ -45,13 +45,14 @@ def test_images_that_share_no_corners_show_no_rest():
 
 
 def test_no_start_is_tried_from_a_minute_at_rest_and_soon_from_what_follows():
-    layout = make_layout({"cam0": "radtan"}, fix=frozenset(), estimate=frozenset(), target_m=board_points())
-    starting = Initializer(CalibrationOptions(), layout, board_points(), None)
+    options = CalibrationOptions()
+    rig = RigModel(options, {"cam0": CameraPrior((752, 480))}, board_points())
+    starting = Initializer(options, rig, None)
     rng, why = np.random.default_rng(2), None
     for t_s in np.arange(0.0, 60.0, 1.0 / RATE_HZ):
         starting.take([(t_s, image(t_s, 0.0, rng))])
         if starting.due(t_s):
-            why = starting.attempt(None, {}, may_be_partial=True)  # a real one would need inertial data
+            why = starting.attempt(None, may_be_partial=True)  # a real one would need inertial data
     assert "at rest" in why.reason
     assert why.motion_missing
     assert starting.oldest_s > 59.9
@@ -60,7 +61,7 @@ def test_no_start_is_tried_from_a_minute_at_rest_and_soon_from_what_follows():
         starting.take([(t_s, image(t_s, 50.0 * (t_s - 60.0), rng))])
         if starting.due(t_s):
             try:
-                starting.attempt(None, {"cam0": None}, may_be_partial=True)
+                starting.attempt(None, may_be_partial=True)
             except AttributeError:  # there are no inertial data here
                 tried_s = t_s
                 break
