@@ -10,13 +10,14 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
+from vical_daemon.estimation.init.late_camera import LateCameras
 from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is_lost
 from vical_daemon.estimation.init.recording_start import RecordingStart
 from vical_daemon.estimation.init.rig_model import RigModel
@@ -71,6 +72,7 @@ class Calibrator:
         self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
         self._initializer = self._new_initializer()
+        self._late = LateCameras(options, self.rig, self._step)
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
@@ -126,7 +128,8 @@ class Calibrator:
 
     def _clock_was_set(self, camera: str) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
-        if self.filter is not None:
+        self._late.anew()
+        if self.filter is not None and camera not in self.filter.absent:
             self._lose_motion()
             self._seek_shift.add(camera)
             self.watch.shift_reopened()
@@ -148,6 +151,7 @@ class Calibrator:
             return []
         if self.filter is None or self.filter.unobservable is not None:
             self._maybe_start()
+        self._maybe_join()
         return self._follow(flush=False)
 
     def finish(self) -> list[FrameReport]:
@@ -156,7 +160,9 @@ class Calibrator:
             return []
         if self.filter is None:
             self._maybe_start(at_end=True)
-        return self._follow(flush=True)
+        reports = self._follow(flush=True)
+        self._maybe_join(at_end=True)
+        return reports + self._follow(flush=True)
 
     def _maybe_start(self, *, at_end: bool = False) -> None:
         """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
@@ -167,7 +173,7 @@ class Calibrator:
             self._buffer.trim(self._initializer.oldest_s - _KEEP_S)
         if not (at_end or self._initializer.due(self._buffer.newest_s)):
             return
-        found = self._initializer.attempt(self._buffer, may_be_partial=self.filter is None)
+        found = self._initializer.attempt(self._buffer, may_be_partial=self.filter is None, at_end=at_end)
         self.evaluator.announce_all(found.news)
         if found.filter is None:
             if self.filter is None:
@@ -177,6 +183,23 @@ class Calibrator:
             event = Event(EventKind.TARGET_SIZE, value=self.rig.size - 1.0)
             self.evaluator.announce(event, once=model_selection.SIZE)
         self._begin(found.filter, found)
+
+    def _maybe_join(self, *, at_end: bool = False) -> None:
+        """Let a camera that sees the target for the first time join the others."""
+        f = self.filter
+        found = None if f is None or self._buffer is None else self._late.attempt(self._buffer, at_end=at_end)
+        if found is None:
+            return
+        if found.rolling is not None:  # one more unknown: everything anew
+            self.rig.estimate_readout(*found.rolling)
+            self.evaluator.announce(Event(ROLLING[found.rolling[1]], found.rolling[0]))
+            self.filter = None
+            self._initializer.anew()
+            self._late.anew()
+        elif found.filter is None:
+            self.evaluator.not_joined = found.reason
+        else:
+            self._begin(found.filter, found)
 
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
         """Go on from a start: use its images, and then the stream."""
@@ -190,6 +213,7 @@ class Calibrator:
         self.evaluator.started(f.state.t_s, found.reason)
         self.watch.started()
         self._initializer.anew()
+        self._late.anew()
         left = self._take_start(f, found.frames)
         self.filter = f.plain()
         for t, frame in [*left, *later]:
@@ -222,6 +246,8 @@ class Calibrator:
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
             if item is None:
                 break
+            if self._late.take(self.filter, *item):
+                continue
             if self._lost is None and motion_is_lost(self.filter, self._buffer, *item, self.rig.target):
                 self._lose_motion()
             if self._lost is None:
@@ -244,7 +270,7 @@ class Calibrator:
             if len(lost.frames) < _SEEK_IMAGES:
                 return []
             lost = self._seek(f, lost, frame.camera)
-        self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
+        self._trim(lost.frames[0][0] if lost.frames else t_cam_s)
         motion = lost.motion(f, self._buffer)
         if motion is None:
             return []
@@ -252,6 +278,11 @@ class Calibrator:
         f.restart_motion(motion)
         self.watch.motion_restarted(motion.t_s)
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
+
+    def _trim(self, needed_s: float) -> None:
+        """Forget readings that nothing will ask for: not those from `needed_s` on."""
+        assert self._buffer is not None
+        self._buffer.trim(min(needed_s, self._initializer.oldest_s, self._late.oldest_s) - _KEEP_S)
 
     def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
         """Propagate a filter to one image and correct it; None where inertial data are missing."""
@@ -280,8 +311,7 @@ class Calibrator:
         if f.unobservable is not None:
             self._initializer.take([(t_cam_s, frame)])
             f.unobservable.follow(f)
-        needed_s = min(f.state.t_s, self._initializer.oldest_s)
-        self._buffer.trim(needed_s - _KEEP_S)
+        self._trim(f.state.t_s)
         self._ask_held_back(f, report, frame, t_cam_s)
         if not f.finite():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
@@ -386,6 +416,7 @@ class Calibrator:
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
         self._unproven = None
+        self._late.anew()
         self.evaluator.changed(self.watch.why)
         self._stale, self.filter = sound, None
         self._initializer = self._new_initializer(sound.off if sound else ())
@@ -435,6 +466,7 @@ class Calibrator:
         self._used_ns.clear()
         self._seek_shift.clear()
         self._initializer.anew()
+        self._late.anew()
         self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()
@@ -442,6 +474,7 @@ class Calibrator:
             self._seek_shift |= f.drifting  # who knows how far, in the time between
             if not common_clock:
                 self._seek_shift |= {n for n, c in cameras.items() if c.timeshift is not None}
+            self._seek_shift -= f.absent
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -448,3 +448,8 @@ def _listed(words: Iterable[Axis | str]) -> str:
     """Join words with commas and "and"."""
     *most, last = list(words) or [""]
     return " and ".join(filter(None, (", ".join(most), last)))
+
+
+def not_in_view(cameras: Iterable[str]) -> str:
+    """Why a rig is not calibrated as a whole: these cameras have not seen the target."""
+    return f"{', '.join(sorted(cameras))}: target not in view yet: show it to this camera, too"

@@ -80,6 +80,7 @@ class CalibrationFilter:
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
         unobservable: After a partial start: axes along which lever arms are not known.
+        absent: Cameras that have not seen the target: their errors stand for nothing.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         wandered: When their drift was found to be another, s, and its values, s/s.
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
@@ -103,6 +104,7 @@ class CalibrationFilter:
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
     unobservable: UnobservableDirections | None = None
+    absent: frozenset[str] = frozenset()
     drifting: set[str] = field(default_factory=set)
     wandered: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     off: set[str] = field(default_factory=set)
@@ -293,8 +295,7 @@ class CalibrationFilter:
         """The image about the nominal state, with the spread of the prior."""
         where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         rolling = where.readout is not None or known.readout_s != 0.0
-        straight = self._view_straight.setdefault(image.camera, LinearityMonitor())
-        sigmas = self.sigmas()
+        straight, sigmas = self._view_straight.setdefault(image.camera, LinearityMonitor()), self.sigmas()
         if not rolling and straight.holds(sigmas):
             return self._with_shared(
                 image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
@@ -384,8 +385,7 @@ class CalibrationFilter:
             motion: Where the rig is, independent of all that the filter knows; of another recording also its
                 biases and gravity.
         """
-        state, dt = self.state, motion.elapsed_s
-        sigmas = motion.sigmas
+        state, dt, sigmas = self.state, motion.elapsed_s, motion.sigmas
         if motion.biases is not None:
             b = motion.biases
             state.gyro_bias, state.accel_bias = b.gyro_bias, b.accel_bias

@@ -15,7 +15,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
-from vical_daemon.estimation.measurements import LEAST_POINTS, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import LEAST_POINTS, FloatArray, Frames, PointsFrame
 
 _NEXT_NS = 400_000_000  # a hand turns a camera by less than 90 degrees in 0.4 s, as the detector assumes
 _CLEARLY = 0.5
@@ -56,6 +56,14 @@ class HalfTurns:
         self._last[frame.camera] = other if turned else frame
         return self._last[frame.camera]
 
+    def from_the_other_end(self, camera: str, frames: Frames) -> Frames | None:
+        """Number images of a camera, up to the newest, from the other end; None: the target has but one."""
+        if not self._alike:
+            return None
+        turned = [(t_s, self._turned(f) if f.camera == camera else f) for t_s, f in frames]
+        self._last[camera] = self._turned(self._last[camera])
+        return turned
+
     def _turned(self, frame: PointsFrame) -> PointsFrame:
         """The same image, numbered from the other end."""
         ids = (len(self._target_m) - 1 - frame.ids)[::-1]
@@ -66,7 +74,7 @@ class HalfTurns:
         self, frame: PointsFrame, t_cam_s: float, f: CalibrationFilter | None, buffer: ImuBuffer | None
     ) -> bool:
         """Whether the board stands on its head, by the attitude that the gyro gives."""
-        if f is None or buffer is None or frame.camera not in f.state.cameras:
+        if f is None or buffer is None or frame.camera in f.absent:
             return False
         camera = f.state.cameras[frame.camera]
         t_s = t_cam_s + camera.timeshift_s

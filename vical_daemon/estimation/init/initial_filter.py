@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -26,9 +28,13 @@ from vical_daemon.estimation.model.state import (
     ATTITUDE,
     GRAVITY,
     GYRO_BIAS,
+    MOTION,
     POSITION,
     VELOCITY,
+    CameraSlices,
+    CameraState,
     Layout,
+    MotionStart,
     State,
 )
 from vical_daemon.estimation.noise.consistency import Consistency
@@ -44,6 +50,7 @@ def initial_filter(
     options: CalibrationOptions,
     still_axes: FloatArray | None = None,
     turn_axis_cam: FloatArray | None = None,
+    absent: Iterable[str] = (),
 ) -> CalibrationFilter:
     """Build a filter about a start, with sigmas many times what the start is worth.
 
@@ -55,11 +62,9 @@ def initial_filter(
         options: Noise.
         still_axes: Of a partial start, see `StartResult`.
         turn_axis_cam: Likewise.
+        absent: Cameras that have not seen the target.
     """
-    cameras = {
-        name: camera if layout.cameras[name].position is None else replace(camera, p_imu_cam=np.zeros(3))
-        for name, camera in state.cameras.items()
-    }
+    cameras = {name: _without_arm(camera, layout.cameras[name]) for name, camera in state.cameras.items()}
     state = replace(state, cameras=cameras)
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
@@ -83,8 +88,36 @@ def initial_filter(
         agreement,
         shared,
         unobservable,
+        frozenset(absent),
         off=off,
     )
+
+
+def with_camera(known: CalibrationFilter, name: str, start: State) -> CalibrationFilter:
+    """A filter as another one, which a camera joins; with sigmas many times what the start is worth.
+
+    Args:
+        known: What is known but for the camera; stays as it is.
+        name: The camera.
+        start: Its numbers, and the motion at the first of its images, as its own images show them.
+    """
+    out, layout = deepcopy(known), known.layout
+    sigmas = filter_sigmas(start, layout, out.off)
+    elapsed_s = max(start.t_s - known.state.t_s, 0.0)
+    motion = start.t_s, start.R_world_imu, start.p_world_imu, start.v_world_imu
+    out.restart_motion(MotionStart(*motion, sigmas[MOTION], elapsed_s))
+    where = layout.cameras[name]
+    out.state.cameras[name] = _without_arm(start.cameras[name], where)
+    root = np.diag(sigmas)[:, layout.errors_of(name)]
+    out.S[layout.errors_of(name)] = 0.0
+    out.inflate_covariance(root)
+    out.absent, out.jumps = out.absent - {name}, None
+    return out
+
+
+def _without_arm(camera: CameraState, where: CameraSlices) -> CameraState:
+    """A camera with the lever arm of any rig, where it is estimated."""
+    return camera if where.position is None else replace(camera, p_imu_cam=np.zeros(3))
 
 
 def filter_sigmas(state: State, layout: Layout, off: set[str]) -> FloatArray:

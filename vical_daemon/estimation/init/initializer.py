@@ -14,16 +14,18 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.attempts import Attempts
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.rig_model import RigModel
-from vical_daemon.estimation.init.velocity_gravity_init import StartResult
-from vical_daemon.estimation.init.window_start import Step, WindowStart, window_start
+from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, Frames, PointsFrame
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.selection import model_selection
+from vical_daemon.estimation.wording import not_in_view
 
-_MIN_SPAN_S = 3.0
+MIN_SPAN_S = 3.0
+_WAIT_S = 2.0 * MIN_SPAN_S  # of images of one camera, for others that have not seen the target
 _MAX_FRAMES = 500
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
@@ -90,7 +92,7 @@ class Initializer:
             frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
             rest.take(t_cam_s, frame)
-            if len(frames) > _MAX_FRAMES and t_cam_s - frames[len(frames) // 2][0] > _MIN_SPAN_S:
+            if len(frames) > _MAX_FRAMES and t_cam_s - frames[len(frames) // 2][0] > MIN_SPAN_S:
                 del frames[: len(frames) // 2]
             if rest.rests_since(frames[0][0]):
                 for name, kept in self._frames.items():
@@ -112,17 +114,23 @@ class Initializer:
         self._newest_s = newest_s
         return self._attempts.due(newest_s) and not (self._attempts.count and self._rests)
 
-    def attempt(self, buffer: ImuBuffer, *, may_be_partial: bool) -> Attempt:
+    def attempt(self, buffer: ImuBuffer, *, may_be_partial: bool, at_end: bool = False) -> Attempt:
         """Try to start; where the data contradict the model of the rig, change that and try again.
 
         Args:
             buffer: Inertial readings.
             may_be_partial: A start with guesses is welcome where the motion shows no more.
+            at_end: No more images will come: do not wait for cameras that have not seen the target.
         """
         rig, news, may_resize = self._rig, list[Event](), True
         size = rig.size
         for _ in range(_MOST_CHANGES):
-            found = self._once(buffer, may_be_partial=may_be_partial, may_resize=may_resize)
+            found = self._once(
+                buffer,
+                may_be_partial=may_be_partial,
+                may_resize=may_resize,
+                wait_s=0.0 if at_end else _WAIT_S,
+            )
             if found.rolling is not None:  # its readout is one more unknown from now on
                 camera, axis = found.rolling
                 rig.estimate_readout(camera, axis)
@@ -136,15 +144,24 @@ class Initializer:
             rig.resize(size)
         return replace(found, news=news)
 
-    def _once(self, buffer: ImuBuffer, *, may_be_partial: bool, may_resize: bool) -> Attempt:
-        """Try to start with the model of the rig as it is; `may_resize`: another size may be suggested."""
+    def _once(self, buffer: ImuBuffer, *, may_be_partial: bool, may_resize: bool, wait_s: float) -> Attempt:
+        """Try to start with the model of the rig as it is.
+
+        Args:
+            buffer: Inertial readings.
+            may_be_partial: See `attempt`.
+            may_resize: Another size may be suggested.
+            wait_s: So many seconds of images of one camera are waited for the others.
+        """
         rig, size = self._rig, self._rig.size
-        short = self._too_short()
-        if short:
+        spans_s = {name: f[-1][0] - f[0][0] if f else 0.0 for name, f in self._frames.items()}
+        ready = [name for name, span_s in spans_s.items() if span_s >= MIN_SPAN_S]
+        short = [name for name in spans_s if name not in ready]
+        if short and max(spans_s.values()) < max(wait_s, MIN_SPAN_S):
             if self._rests:
                 return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
-            if len(short) < len(self._frames):
-                return _none(f"{', '.join(short)}: target not in view yet; all cameras start together")
+            if ready:
+                return _none(not_in_view(short))
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)
@@ -152,8 +169,9 @@ class Initializer:
         if size != 1.0:
             options = replace(options, estimate=options.estimate | {model_selection.SIZE})
         options = replace(options, imu_noise=measured_noise(options.imu_noise, buffer.rows))
+        frames, priors = ({name: x[name] for name in ready} for x in (self._frames, rig.priors))
         data = start.StartData(
-            buffer, self._frames, rig.priors, options, rig.layout, rig.target, may_resize, self._may_look()
+            buffer, frames, priors, options, rig.layout, rig.target, may_resize, self._may_look()
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:
@@ -161,20 +179,26 @@ class Initializer:
         other = None if result.size is None else Attempt(size=size * result.size)
         if result.state is None:
             return other or _none(result.reason, result.motion_missing)
-        frames, stated = self._frames_from(result.state), 1.0 / size
-        found = self._window(buffer, options, result.state, result, frames, stated)
+        images = frames_from([x for kept in frames.values() for x in kept], result.state)
+        others = {name: starting_camera(rig.priors[name]) for name in short}
+        state = replace(result.state, cameras={**result.state.cameras, **others})
+        make = partial(
+            initial_filter,
+            layout=rig.layout,
+            options=options,
+            still_axes=result.still_axes,
+            turn_axis_cam=result.turn_axis_cam,
+            absent=short,
+        )
+        poses, stated = result.poses, 1.0 / size
+        found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
         found.filter.began_s = found.filter.state.t_s
-        return Attempt(found.filter, frames, result.reason)
-
-    def _too_short(self) -> list[str]:
-        """Return the cameras that have not seen enough yet."""
-        seen = self._frames.items()
-        return [name for name, f in seen if len(f) < 2 or f[-1][0] - f[0][0] < _MIN_SPAN_S]
+        return Attempt(found.filter, images, result.reason)
 
     def _may_look(self) -> bool:
         """Whether enough is new to look for a rolling shutter once more."""
@@ -183,37 +207,14 @@ class Initializer:
             self._next_look_s = self._newest_s + _LOOK_S
         return look
 
-    def _window(
-        self,
-        buffer: ImuBuffer,
-        options: CalibrationOptions,
-        state: State,
-        result: StartResult,
-        frames: Frames,
-        stated: float,
-    ) -> WindowStart | None:
-        """Adjust a window from `state` on; see `window_start`."""
-        make = partial(
-            initial_filter,
-            layout=self._rig.layout,
-            options=options,
-            still_axes=result.still_axes,
-            turn_axis_cam=result.turn_axis_cam,
-        )
-        return window_start(
-            state, result.poses, frames, make, self._step, buffer, self._rig.target, stated=stated
-        )
 
-    def _frames_from(self, state: State) -> Frames:
-        """Images from the time of the state on, with their stamps, s; in the order of IMU time."""
-        shifts = {name: c.timeshift_s for name, c in state.cameras.items()}
-        frames = [
-            (t, f)
-            for kept in self._frames.values()
-            for t, f in kept
-            if t + shifts[f.camera] > state.t_s - LATE_S
-        ]
-        return sorted(frames, key=lambda item: item[0] + shifts[item[1].camera])
+def frames_from(frames: Frames, state: State) -> Frames:
+    """Images from the time of the state on, with their stamps, s; in the order of IMU time."""
+
+    def t_imu_s(item: tuple[float, PointsFrame]) -> float:
+        return item[0] + state.cameras[item[1].camera].timeshift_s
+
+    return sorted((x for x in frames if t_imu_s(x) > state.t_s - LATE_S), key=t_imu_s)
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:

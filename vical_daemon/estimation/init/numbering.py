@@ -11,11 +11,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry.so3 import nearest_rotation
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import State
 
-_TURNED_RAD = math.pi / 4
+TURNED_RAD = math.pi / 4
 """Half of the smallest turn, a quarter, that brings the points of a square target onto others."""
 _TOGETHER_S = 0.05
 """Images that are no further apart show the rig in the same attitude: to 6 deg at 2 rad/s."""
@@ -30,13 +33,38 @@ def numbered_differently(known: Mapping[str, RotationsKnown]) -> str:
     first, *others = known
     for name in others:
         turn = _turn(known[first], known[name])
-        angle = 0.0 if turn is None else math.acos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))
-        if angle > _TURNED_RAD:
-            return (
-                f"{first} and {name} number the points of the target differently: by {name} it is turned by "
-                f"{math.degrees(angle):.0f} deg; give the same point the same id in all cameras"
-            )
+        angle = 0.0 if turn is None else _angle(turn)
+        if angle > TURNED_RAD:
+            return numbering_problem(first, name, angle)
     return ""
+
+
+def numbering_problem(first: str, other: str, angle_rad: float) -> str:
+    """Return in words that two cameras number the points differently, and by how much."""
+    return (
+        f"{first} and {other} number the points of the target differently: by {other} it is turned by "
+        f"{math.degrees(angle_rad):.0f} deg; give the same point the same id in all cameras"
+    )
+
+
+def turned_by(known: CalibrationFilter, state: State, buffer: ImuBuffer) -> float:
+    """Return by how much an attitude differs from what a filter knew and the gyro since then, rad.
+
+    Args:
+        known: The filter at an instant before.
+        state: With the attitude, not before the filter's.
+        buffer: Inertial readings; where some are missing in between, nobody knows: 0.
+    """
+    segment = buffer.segment(known.state.t_s, state.t_s)
+    if segment is None or buffer.gap_within(known.state.t_s, state.t_s):
+        return 0.0
+    ahead = known.copy()
+    ahead.predict(segment)
+    return _angle(ahead.state.R_world_imu.T @ state.R_world_imu)
+
+
+def _angle(R: FloatArray) -> float:
+    return math.acos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0))
 
 
 def _turn(a: RotationsKnown, b: RotationsKnown) -> FloatArray | None:

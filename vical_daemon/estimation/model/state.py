@@ -99,6 +99,14 @@ class Layout:
         assert where.distortion is not None
         return slice(where.intrinsics.start, where.distortion.stop)
 
+    def errors_of(self, camera: str) -> list[int]:
+        """Where all errors of a camera lie."""
+        where = self.cameras[camera]
+        blocks = where.position, where.rotation, where.intrinsics, where.distortion
+        places = [np.r_[block] for block in blocks if block is not None]
+        ones = [place for place in (where.timeshift, where.skew, where.readout) if place is not None]
+        return [*np.concatenate([*places, ones]).astype(int).tolist()]
+
     def lens_free(self, camera: str) -> bool:
         """Whether a lens is estimated, not held."""
         return self.cameras[camera].intrinsics is not None and camera not in self.held

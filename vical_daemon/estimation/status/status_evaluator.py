@@ -24,6 +24,7 @@ from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_erro
 from vical_daemon.estimation.status.image_coverage import Cover
 from vical_daemon.estimation.status.mounting_changes import differences, visible_move_m
 from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.wording import not_in_view
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
@@ -45,6 +46,7 @@ class StatusEvaluator(Evaluator):
         self.frames = 0
         self.in_doubt = ""
         self.clocks_doubtful = False  # a time shift may be drifting
+        self.not_joined = ""  # why a camera that is seen now could not join the others yet
         self._partial = ""
         self._reopened_s = -np.inf
         self._points = [0, 0]
@@ -59,6 +61,7 @@ class StatusEvaluator(Evaluator):
     def started(self, t_s: float, partial: str = "") -> None:
         """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
         self.reason, self._started_s, self._partial = "", t_s, partial
+        self.not_joined = ""
         self._recent_used.clear()
         self._squares.clear()
         self._held_back.clear()
@@ -130,13 +133,13 @@ class StatusEvaluator(Evaluator):
         f = None if f is None else self.weighed(f, shares)
         stale = None if stale is None else self.weighed(stale)
         shown = f or stale
-        cameras = {} if shown is None else {name: self._camera(name, shown) for name in shown.layout.cameras}
+        cameras = {} if shown is None else {name: self._camera(name, shown) for name in _seen(shown)}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
         verdict = self._decide(f, missing)
         if f is None:
             reported = self._published(verdict)
         else:
-            first = next(iter(f.state.cameras.values()))
+            first = f.state.cameras[_seen(f)[0]]
             reported = self._followed(verdict, first.R_imu_cam, f.state.gyro_bias)
             if not reported.guidance and self.status != Status.INCONSISTENT:
                 reported = reported._replace(guidance=self._cover.advice())
@@ -165,7 +168,7 @@ class StatusEvaluator(Evaluator):
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in f.layout.cameras)
+        drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in _seen(f))
         if self.clocks_doubtful or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
         if any(x.wander_px for x in f.shared.values()):
@@ -209,6 +212,8 @@ class StatusEvaluator(Evaluator):
         if not lacking:
             if self._partial:
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
+            if f.absent:
+                return Verdict(Status.CONVERGING, self.not_joined or not_in_view(f.absent))
             enough = self.frames >= _RECENT and span >= _ENOUGH_S
             return self._once_known(enough=enough, doubt=self.in_doubt)
         lens = self._lens_to_blame(f, missing)
@@ -219,7 +224,7 @@ class StatusEvaluator(Evaluator):
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """The camera whose fixed lens is the only reason why something is missing; empty: there is none."""
-        cameras = {name: lens_known(self._camera(name, f)) for name in f.layout.held}
+        cameras = {name: lens_known(self._camera(name, f)) for name in _seen(f) if name in f.layout.held}
         if not cameras or any(self._missing(e, name, f) for name, e in cameras.items()):
             return ""
         return max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
@@ -232,3 +237,8 @@ class StatusEvaluator(Evaluator):
         if len(self._squares) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
+
+
+def _seen(f: CalibrationFilter) -> list[str]:
+    """Cameras that have seen the target."""
+    return [name for name in f.layout.cameras if name not in f.absent]

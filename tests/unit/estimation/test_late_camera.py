@@ -1,0 +1,114 @@
+"""A camera that sees the target later than the others joins them, against the truth of both."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vical_mocks.points import simulate
+from vical_mocks.rig import reference_rig
+
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import Status
+
+SEED, LENGTH_S = 1, 24.0
+TURN = Rotation.from_euler("yx", [15.0, 5.0], degrees=True).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Two cameras on one rig: the same motion and readings, corner noise of their own."""
+    first = reference_rig(SEED)
+    second = replace(
+        first,
+        R_imu_cam=first.R_imu_cam @ TURN,
+        p_imu_cam=first.p_imu_cam + [0.08, -0.02, 0.03],
+        timeshift_cam_imu_s=0.012,
+    )
+    return {"cam0": simulate(SEED, LENGTH_S, rig=first), "cam1": simulate(SEED + 1, LENGTH_S, rig=second)}
+
+
+def calibrate(runs, seen, renumber=None, alike=False):
+    """Feed both cameras where `seen(name, seconds)`; numbers of cam1 from `renumber`. Estimates, one a second."""
+    lens = runs["cam0"].rig.lens
+    known = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=alike)
+    c = Calibrator(options, dict.fromkeys(runs, known), runs["cam0"].points_m)
+    data = runs["cam0"]
+    begin_ns = int(data.t_imu_ns[0])
+    frames = [
+        PointsFrame(name, f.t_cam_ns, f.ids if name == "cam0" or renumber is None else renumber(f.ids), f.uv_px)
+        for name, run in runs.items()
+        for f in run.frames
+        if seen(name, 1e-9 * (f.t_cam_ns - begin_ns))
+    ]
+    frames.sort(key=lambda f: f.t_cam_ns)
+    estimates, k = [], 0
+    for n, (t, w, f) in enumerate(zip(data.t_imu_ns, data.gyro_rps, data.specific_force_mps2, strict=True)):
+        c.add_imu(int(t), w, f)
+        while k < len(frames) and frames[k].t_cam_ns <= t:
+            c.add_points(frames[k])
+            c.process()
+            k += 1
+        if n % 100 == 99:
+            estimates.append(c.estimate())
+    c.finish()
+    return [*estimates, c.estimate()]
+
+
+def largest_z(estimate, runs):
+    """Largest error over its sigma, of lever arm, mounting and time shift of all cameras."""
+    worst = 0.0
+    for name, e in estimate.cameras.items():
+        rig = runs[name].rig
+        turn = rig.R_imu_cam.T @ Rotation.from_quat(np.roll(e.T_imu_cam.q_wxyz, -1)).as_matrix()
+        error = np.concatenate(
+            [
+                np.array(e.T_imu_cam.p_m) - rig.p_imu_cam,
+                Rotation.from_matrix(turn).as_rotvec(),
+                [e.timeshift_cam_imu_s - rig.timeshift_cam_imu_s],
+            ]
+        )
+        sigma = np.sqrt([*np.diag(e.T_imu_cam.covariance), e.timeshift_sigma_s**2])
+        worst = max(worst, float(np.abs(error / sigma).max()))
+    return worst
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        lambda name, t_s: name == "cam0" or t_s > 9.0,
+        lambda name, t_s: t_s < 9.0 if name == "cam0" else t_s > 11.0,
+    ],
+    ids=["both from 9 s on", "never both"],
+)
+def test_a_camera_that_comes_later_joins_those_that_are_calibrated(runs, seen):
+    estimates = calibrate(runs, seen)
+    alone = [e for e in estimates if list(e.cameras) == ["cam0"]]
+    assert alone
+    assert all(e.reason.startswith("cam1: target not in view yet") for e in alone[3:])
+    assert list(estimates[-1].cameras) == ["cam0", "cam1"]
+    assert estimates[-1].status is Status.CONVERGED
+    assert max(largest_z(e, runs) for e in estimates) < 4.0  # 14 numbers, 20 estimates: 1 in 500 by chance
+    both = next(e for e in estimates if len(e.cameras) == 2)
+    sigma_m = np.sqrt(np.diag(both.cameras["cam0"].T_imu_cam.covariance)[:3])
+    before_m = np.sqrt(np.diag(alone[-1].cameras["cam0"].T_imu_cam.covariance)[:3])
+    assert (sigma_m < 1.1 * before_m).all()  # nothing that was known is lost
+
+
+def test_a_late_camera_that_numbers_the_target_from_the_other_end_is_put_right(runs):
+    """An 8 x 6 checkerboard looks the same after half a turn."""
+    last = len(runs["cam0"].points_m) - 1
+    options = {"renumber": lambda ids: last - ids, "alike": True}
+    end = calibrate(runs, lambda name, t_s: name == "cam0" or t_s > 9.0, **options)[-1]
+    assert list(end.cameras) == ["cam0", "cam1"]
+    assert largest_z(end, runs) < 4.0
+
+
+def test_a_late_camera_that_numbers_a_target_differently_does_not_join(runs):
+    last = len(runs["cam0"].points_m) - 1
+    end = calibrate(runs, lambda name, t_s: name == "cam0" or t_s > 9.0, renumber=lambda ids: last - ids)[-1]
+    assert list(end.cameras) == ["cam0"]
+    assert "cam0 and cam1 number the points of the target differently" in end.reason
+    assert largest_z(end, runs) < 4.0
