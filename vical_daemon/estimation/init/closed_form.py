@@ -116,9 +116,9 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
             lens, data.priors[name], data.options.fix, found.R_imu_cam, found.timeshift_cam_imu_s
         )
         rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
-    why = numbered_differently(rough)
-    if why:
-        return StartResult(None, why)
+    turned = numbered_differently(rough)
+    if turned is not None:
+        return StartResult(None, str(turned), half_turned=turned.other if turned.half else "")
     return motion_start(data.buffer, rough, data.options, may_resize=data.may_resize)
 
 

@@ -28,11 +28,11 @@ class HalfTurns:
 
     Args:
         target_m: Points of the target, m, shape (n, 3).
-        alike: A half turn maps the target onto itself; otherwise nothing is done.
+        alike: A half turn maps the target onto itself; otherwise images are left as they are.
     """
 
     def __init__(self, target_m: FloatArray, *, alike: bool) -> None:
-        self._target_m, self._alike = target_m, alike
+        self._target_m, self.alike = target_m, alike
         self._last: dict[str, PointsFrame] = {}
 
     def numbered(
@@ -46,7 +46,7 @@ class HalfTurns:
             f: The filter, after the image before; None: there is none yet.
             buffer: Readings.
         """
-        if not self._alike or len(frame.ids) < LEAST_POINTS:
+        if not self.alike or len(frame.ids) < LEAST_POINTS:
             return frame
         last, other = self._last.get(frame.camera), self._turned(frame)
         if last is not None and 0 < frame.t_cam_ns - last.t_cam_ns <= _NEXT_NS:
@@ -56,13 +56,10 @@ class HalfTurns:
         self._last[frame.camera] = other if turned else frame
         return self._last[frame.camera]
 
-    def from_the_other_end(self, camera: str, frames: Frames) -> Frames | None:
-        """Number images of a camera, up to the newest, from the other end; None: the target has but one."""
-        if not self._alike:
-            return None
-        turned = [(t_s, self._turned(f) if f.camera == camera else f) for t_s, f in frames]
+    def from_the_other_end(self, camera: str, frames: Frames) -> Frames:
+        """Number images of a camera, up to its newest one, from the other end; those of others are left."""
         self._last[camera] = self._turned(self._last[camera])
-        return turned
+        return [(t_s, self._turned(f) if f.camera == camera else f) for t_s, f in frames]
 
     def _turned(self, frame: PointsFrame) -> PointsFrame:
         """The same image, numbered from the other end."""

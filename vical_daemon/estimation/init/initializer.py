@@ -44,6 +44,7 @@ class Attempt:
         motion_missing: It is motion that is missing, not time.
         rolling: See `StartResult`.
         size: The target seems to be so many times as large as in its file, and is to be taken as that large.
+        half_turned: See `StartResult`, where the target looks the same then.
         news: What was found to be not as specified.
     """
 
@@ -53,6 +54,7 @@ class Attempt:
     motion_missing: bool = False
     rolling: tuple[str, str] | None = None
     size: float | None = None
+    half_turned: str = ""
     news: list[Event] = field(default_factory=list)
 
 
@@ -138,6 +140,9 @@ class Initializer:
             elif found.size is not None:  # where that is far off, it is estimated
                 rig.resize(found.size)
                 may_resize &= rig.size != 1.0  # the size in the file was found to fit
+            elif found.half_turned:
+                camera = found.half_turned
+                self._frames[camera] = rig.turns.from_the_other_end(camera, self._frames[camera])
             else:
                 break
         if found.filter is None and rig.size != size:
@@ -169,11 +174,13 @@ class Initializer:
         if size != 1.0:
             options = replace(options, estimate=options.estimate | {model_selection.SIZE})
         options = replace(options, imu_noise=measured_noise(options.imu_noise, buffer.rows))
-        frames, priors = ({name: x[name] for name in ready} for x in (self._frames, rig.priors))
+        frames, priors = {n: self._frames[n] for n in ready}, {n: rig.priors[n] for n in ready}
         data = start.StartData(
             buffer, frames, priors, options, rig.layout, rig.target, may_resize, self._may_look()
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
+        if result.half_turned and rig.turns.alike:
+            return Attempt(reason=result.reason, half_turned=result.half_turned)
         if result.rolling is not None:
             return Attempt(rolling=result.rolling)
         other = None if result.size is None else Attempt(size=size * result.size)

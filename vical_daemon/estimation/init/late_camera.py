@@ -6,7 +6,6 @@ that has what the filter knew before the first of them for its prior, so that no
 
 from __future__ import annotations
 
-import math
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,7 @@ from vical_daemon.estimation.init.attempts import LONG_S, Attempts
 from vical_daemon.estimation.init.closed_form import StartData
 from vical_daemon.estimation.init.initial_filter import with_camera
 from vical_daemon.estimation.init.initializer import MIN_SPAN_S, Attempt, frames_from
-from vical_daemon.estimation.init.numbering import TURNED_RAD, numbering_problem, turned_by
+from vical_daemon.estimation.init.numbering import late_numbered_differently
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import TargetPose, recent_poses
@@ -82,11 +81,14 @@ class LateCameras:
             return None
         self._attempts.tried(own[-1][0])
         found = self._join(self._known, buffer)
+        if found.half_turned:
+            self._frames = self._rig.turns.from_the_other_end(self._camera, self._frames)
+            found = self._join(self._known, buffer)
         if found.filter is None and found.rolling is None and own[-1][0] - own[0][0] > LONG_S:
             self.anew()
         return found
 
-    def _join(self, known: CalibrationFilter, buffer: ImuBuffer, *, may_turn: bool = True) -> Attempt:
+    def _join(self, known: CalibrationFilter, buffer: ImuBuffer) -> Attempt:
         """Try with the images as they are numbered now."""
         name, rig, frames = self._camera, self._rig, self._frames
         priors = {name: rig.priors[name]}
@@ -95,9 +97,9 @@ class LateCameras:
         result = closed_form.attempt(data, may_be_partial=False)
         if result.state is None:
             return Attempt(reason=result.reason, rolling=result.rolling)
-        turned_rad = turned_by(known, result.state, buffer)
-        if turned_rad > TURNED_RAD:
-            return self._renumbered(turned_rad, buffer, may_turn=may_turn)
+        turned = late_numbered_differently(known, name, result.state, buffer)
+        if turned is not None:
+            return Attempt(reason=str(turned), half_turned=name if turned.half and rig.turns.alike else "")
         start = result.state
         state = replace(
             known.state,
@@ -123,15 +125,3 @@ class LateCameras:
             own = at_middle_row(own, camera.readout_s, camera.resolution, camera.readout_axis)
             out += recent_poses(own, camera, self._rig.target)
         return out
-
-    def _renumbered(self, turned_rad: float, buffer: ImuBuffer, *, may_turn: bool) -> Attempt:
-        """By this camera the target is turned: a half turn is put right where it looks the same then."""
-        name, known = self._camera, self._known
-        assert known is not None
-        half = may_turn and turned_rad > math.pi - TURNED_RAD
-        turned = self._rig.turns.from_the_other_end(name, self._frames) if half else None
-        if turned is None:
-            first = next(other for other in known.state.cameras if other not in known.absent)
-            return Attempt(reason=numbering_problem(first, name, turned_rad))
-        self._frames = turned
-        return self._join(known, buffer, may_turn=False)

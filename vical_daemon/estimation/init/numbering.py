@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,14 +19,41 @@ from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import State
 
-TURNED_RAD = math.pi / 4
+_TURNED_RAD = math.pi / 4
 """Half of the smallest turn, a quarter, that brings the points of a square target onto others."""
 _TOGETHER_S = 0.05
 """Images that are no further apart show the rig in the same attitude: to 6 deg at 2 rad/s."""
 
 
-def numbered_differently(known: Mapping[str, RotationsKnown]) -> str:
-    """Return in words which camera numbers the points unlike the first one; empty: none is seen to.
+class Turned(NamedTuple):
+    """By one camera the target is turned against what it is by another.
+
+    Attributes:
+        first: A camera.
+        other: The one by which the target is turned.
+        angle_rad: By how much.
+    """
+
+    first: str
+    other: str
+    angle_rad: float
+
+    @property
+    def half(self) -> bool:
+        """Whether it is about half a turn: some targets look the same then."""
+        return self.angle_rad > math.pi - _TURNED_RAD
+
+    def __str__(self) -> str:
+        """Say what is wrong, and what to do."""
+        return (
+            f"{self.first} and {self.other} number the points of the target differently: by {self.other} "
+            f"it is turned by {math.degrees(self.angle_rad):.0f} deg; "
+            "give the same point the same id in all cameras"
+        )
+
+
+def numbered_differently(known: Mapping[str, RotationsKnown]) -> Turned | None:
+    """Return a camera that numbers the points unlike the first one; None: none is seen to.
 
     Args:
         known: By camera: poses of the target, mounting and time shift by rotations.
@@ -34,33 +62,30 @@ def numbered_differently(known: Mapping[str, RotationsKnown]) -> str:
     for name in others:
         turn = _turn(known[first], known[name])
         angle = 0.0 if turn is None else _angle(turn)
-        if angle > TURNED_RAD:
-            return numbering_problem(first, name, angle)
-    return ""
+        if angle > _TURNED_RAD:
+            return Turned(first, name, angle)
+    return None
 
 
-def numbering_problem(first: str, other: str, angle_rad: float) -> str:
-    """Return in words that two cameras number the points differently, and by how much."""
-    return (
-        f"{first} and {other} number the points of the target differently: by {other} it is turned by "
-        f"{math.degrees(angle_rad):.0f} deg; give the same point the same id in all cameras"
-    )
-
-
-def turned_by(known: CalibrationFilter, state: State, buffer: ImuBuffer) -> float:
-    """Return by how much an attitude differs from what a filter knew and the gyro since then, rad.
+def late_numbered_differently(
+    known: CalibrationFilter, name: str, state: State, buffer: ImuBuffer
+) -> Turned | None:
+    """Likewise for a camera that joins others later, by their attitude and the gyro since then.
 
     Args:
         known: The filter at an instant before.
-        state: With the attitude, not before the filter's.
-        buffer: Inertial readings; where some are missing in between, nobody knows: 0.
+        name: The camera.
+        state: With the attitude by its images, not before the filter's.
+        buffer: Inertial readings; where some are missing in between, nobody knows: None.
     """
     segment = buffer.segment(known.state.t_s, state.t_s)
     if segment is None or buffer.gap_within(known.state.t_s, state.t_s):
-        return 0.0
+        return None
     ahead = known.copy()
     ahead.predict(segment)
-    return _angle(ahead.state.R_world_imu.T @ state.R_world_imu)
+    angle_rad = _angle(ahead.state.R_world_imu.T @ state.R_world_imu)
+    first = next(other for other in known.state.cameras if other not in known.absent)
+    return Turned(first, name, angle_rad) if angle_rad > _TURNED_RAD else None
 
 
 def _angle(R: FloatArray) -> float:

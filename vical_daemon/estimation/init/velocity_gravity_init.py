@@ -34,6 +34,7 @@ class StartResult:
             where a window does not fit with the stated one. None: it may be as in its file.
         rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
             the other (`ROWS`, `COLUMNS`); None: there is none.
+        half_turned: A camera by which the target is upside down against what it is by another; empty: none.
     """
 
     state: State | None
@@ -44,6 +45,7 @@ class StartResult:
     poses: list[TargetPose] = field(default_factory=list)
     size: float | None = None
     rolling: tuple[str, str] | None = None
+    half_turned: str = ""
 
 
 @dataclass(frozen=True, slots=True)

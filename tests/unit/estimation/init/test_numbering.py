@@ -42,14 +42,17 @@ def test_cameras_that_number_alike_pass(angle_deg):
         "cam0": known("cam0", Rotation.identity()),
         "cam1": known("cam1", turn, shift_s=0.2, begin_s=0.03),
     }
-    assert numbered_differently(rig) == ""
+    assert numbered_differently(rig) is None
 
 
 @pytest.mark.parametrize("angle_deg", [90.0, -90.0, 180.0])
 def test_a_camera_that_numbers_differently_is_named(angle_deg):
     turn = Rotation.from_euler("z", angle_deg, degrees=True)
     rig = {"cam0": known("cam0", Rotation.identity()), "cam1": known("cam1", turn, shift_s=-0.1)}
-    text = numbered_differently(rig)
+    turned = numbered_differently(rig)
+    assert turned.other == "cam1"
+    assert turned.half == (abs(angle_deg) == 180.0)
+    text = str(turned)
     assert "cam0 and cam1 number the points of the target differently" in text
     assert int(text.split("turned by ")[1].split()[0]) == pytest.approx(abs(angle_deg), abs=3)
 
@@ -57,8 +60,8 @@ def test_a_camera_that_numbers_differently_is_named(angle_deg):
 def test_cameras_that_never_see_the_target_together_cannot_be_compared():
     turn = Rotation.from_euler("z", 180.0, degrees=True)
     rig = {"cam0": known("cam0", Rotation.identity()), "cam1": known("cam1", turn, begin_s=60.0)}
-    assert numbered_differently(rig) == ""
+    assert numbered_differently(rig) is None
 
 
 def test_one_camera_alone_passes():
-    assert numbered_differently({"cam0": known("cam0", Rotation.identity())}) == ""
+    assert numbered_differently({"cam0": known("cam0", Rotation.identity())}) is None
