@@ -97,7 +97,7 @@ def _probe(path: str) -> dict[str, object]:
     from vical_drivers.microstrain.probe import connect
 
     try:
-        session, port = connect(path, patient=False)
+        session, port = connect(path, patient=False, advice="check power and cable")
         try:
             info = session.identify()
         finally:
@@ -127,7 +127,8 @@ def _print_ports(ports: list[dict[str, object]]) -> None:
                 f"{p['protocol']} at {p['baud']} baud  -> port: {p['port']}"
             )
         else:
-            print(f"serial  {p['port']:<24} {p.get('problem', 'not asked')}")
+            problem = str(p.get("problem", "not asked")).removeprefix(f"{p['port']}: ")
+            print(f"serial  {p['port']:<24} {problem}")
     if not ports:
         print("no serial port found; name one with --port")
 

@@ -36,6 +36,7 @@ def connect(
     *,
     patient: bool = True,
     bauds: Sequence[int] | None = None,
+    advice: str = "check power and cable, or name another port (`vical devices` lists them)",
 ) -> tuple[_Found, SerialPort]:
     """Open a port and find the device on it; its stream is stopped.
 
@@ -49,6 +50,7 @@ def connect(
         baud: Tried first; None: the factory's.
         patient: Wait for a device that samples at 1 Hz, and for one that is just being powered up.
         bauds: To be tried, and no others; None: all that are known.
+        advice: What the message tells to do where nothing answers.
 
     Raises:
         DeviceNotFoundError: Nothing there answers in a known protocol at a known baud.
@@ -68,8 +70,7 @@ def connect(
     port.close()
     what = "MicroStrain sensor" if protocol == "auto" else f"MicroStrain sensor that speaks {protocol}"
     raise DeviceNotFoundError(
-        f"{path}: no {what} answers here at {', '.join(map(str, dict.fromkeys(bauds)))} baud; "
-        "check power and cable, or name another port (`vical devices` lists them)"
+        f"{path}: no {what} answers here at {', '.join(map(str, dict.fromkeys(bauds)))} baud; {advice}"
     )
 
 
