@@ -247,6 +247,8 @@ class Calibrator:
             if item is None:
                 break
             if self._late.take(self.filter, *item):
+                if self.filter.unobservable is not None:  # a full start is still to come
+                    self._initializer.take([item])
                 continue
             if self._lost is None and motion_is_lost(self.filter, self._buffer, *item, self.rig.target):
                 self._lose_motion()

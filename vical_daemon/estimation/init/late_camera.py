@@ -66,7 +66,7 @@ class LateCameras:
             Whether it is of an absent camera, so that the filter cannot use it.
         """
         absent = frame.camera in f.absent
-        if self._known is None and absent:
+        if self._known is None and absent and f.unobservable is None:
             self._known, self._camera = deepcopy(f), frame.camera
         if self._known is not None and (not absent or frame.camera == self._camera):
             self._frames.append((t_cam_s, frame))
