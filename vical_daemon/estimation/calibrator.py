@@ -324,8 +324,9 @@ class Calibrator:
             (_, camera, before_s), self._unproven = self._unproven, None
             step_s = f.state.cameras[camera].timeshift_s - before_s
             self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
-        for block, event in self._acceptance.look(f).items():
-            self.evaluator.announce(event, once=block)
+        if f.unobservable is None:  # with guesses nothing can be said of what else may be off
+            for block, event in self._acceptance.look(f).items():
+                self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
         return [report]
 
@@ -353,7 +354,8 @@ class Calibrator:
             return
         if action is Action.POSE:
             self._lose_motion()
-            self.evaluator.announce(Event(EventKind.POSE_LOST))
+            if f.unobservable is None:
+                self.evaluator.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
             once = f"wander {frame.camera}" if anew else ""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from vical_daemon.estimation.filter.unobservable_directions import HELD_M, STILL_RAD
 from vical_daemon.estimation.geometry import so3
@@ -124,6 +125,7 @@ def linear_start(
     known: FloatArray | None = None,
     held_axes: FloatArray | None = None,
     free_size: bool = False,
+    force_sigma: float = 0.0,
 ) -> LinearStart:
     """Solve velocity, gravity, lever arm and accelerometer bias, or some of them, from positions.
 
@@ -136,6 +138,7 @@ def linear_start(
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
         free_size: Find the size of the target, too, by which positions scale.
+        force_sigma: Of the acceleration at each instant, m/s^2: gravity times the error of an attitude.
     """
     n, z = len(p_world_cam), np.zeros(12) if known is None else known.copy()
     free = np.concatenate([np.arange(12)[part] for part in unknown])
@@ -143,10 +146,11 @@ def linear_start(
     columns = [motion.A[:, :, free], np.broadcast_to(np.eye(3), (n, 3, 3))]  # z and p_0
     columns += [-p_world_cam[:, :, None]] if free_size else []
     A = np.concatenate(columns, axis=2)
-    w = 1.0 / position_sigma
-    rows = (A * w[:, None, None]).reshape(-1, A.shape[2])
     left = (0.0 if free_size else p_world_cam) - motion.D - motion.A[:, :, fixed] @ z[fixed]
-    y = (left * w[:, None]).ravel()
+    noise = np.diag(position_sigma**2) + drift_covariance(motion.T, force_sigma)
+    both = np.concatenate([A, left[:, :, None]], axis=2)
+    white = solve_triangular(np.linalg.cholesky(noise), both.reshape(n, -1), lower=True).reshape(3 * n, -1)
+    rows, y = white[:, :-1], white[:, -1]
     prior = np.zeros((6, 12))
     prior[:3, BIAS] = np.eye(3) / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
@@ -161,6 +165,20 @@ def linear_start(
     sigmas[free] = sigma[:k]
     size = (float(x[k + 3]), float(sigma[k + 3])) if free_size else (1.0, 0.0)
     return LinearStart(x[k : k + 3], z[SPEED], z[GRAVITY], z[ARM], z[BIAS], sigmas[ARM], *size)
+
+
+def drift_covariance(T: FloatArray, force_sigma: float) -> FloatArray:
+    """Covariance of positions that drift with white errors of the acceleration, by axis, m^2, shape (n, n).
+
+    With the density q^2 = sigma^2 dt the double integral has the covariance q^2 s^2 (3 t - s) / 6 at s <= t.
+
+    Args:
+        T: Instants since the first, s, shape (n,).
+        force_sigma: Of the acceleration at each, m/s^2.
+    """
+    near, far = np.minimum(T[:, None], T), np.maximum(T[:, None], T)
+    density = force_sigma**2 * T[-1] / max(len(T) - 1, 1)
+    return density * near**2 * (3.0 * far - near) / 6.0
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

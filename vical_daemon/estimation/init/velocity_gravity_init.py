@@ -6,15 +6,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.so3 import nearest_rotation
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_model import over_intervals, products, strapdown
 from vical_daemon.estimation.init.linear_start import LinearMotion, LinearStart, linear_start, still_axes
-from vical_daemon.estimation.init.target_poses import TargetPose
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _STRETCH_S = 10.0
-_DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
+_NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
 
 
 @dataclass(slots=True)
@@ -99,14 +102,15 @@ def motion_start(
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
         R, p, sigma, t = _poses_of_imu(inside, camera)
+        tilt_mps2 = options.gravity_mps2 * float(np.sqrt(np.mean(attitude_sigmas(inside, camera) ** 2)))
         axes: FloatArray | None = None
         if partial:
-            sigma = np.maximum(sigma, _DRIFT_M)
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
+        R = by_neighbours(buffer, t, R, gyro_bias)
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
         if motion is not None and may_resize and not partial:
-            other = other or _other_size(motion, p, sigma, options.gravity_mps2)
-        linear = None if motion is None else linear_start(motion, p, sigma, held_axes=axes)
+            other = other or _other_size(motion, p, sigma, tilt_mps2, options.gravity_mps2)
+        linear = None if motion is None else linear_start(motion, p, sigma, held_axes=axes, force_sigma=tilt_mps2)
         if linear is None or (float(np.max(linear.sigma_p_imu_cam)) > 0.1 and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
             return StartResult(None, why, motion_missing=True, size=other)
@@ -124,18 +128,45 @@ def motion_start(
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used, size=other)
 
 
-def _other_size(motion: LinearMotion, p: FloatArray, sigma: FloatArray, gravity_mps2: float) -> float | None:
+def _other_size(
+    motion: LinearMotion, p: FloatArray, sigma: FloatArray, tilt_mps2: float, gravity_mps2: float
+) -> float | None:
     """Size of the target over the stated one, where positions and accelerations suggest another one.
 
     Noise of the positions, which the size multiplies, and of the attitudes make it wrong by ten of its sigmas
     where the rig moves slowly.
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
-    found = linear_start(motion, p, sigma, free_size=True)
+    found = linear_start(motion, p, sigma, free_size=True, force_sigma=tilt_mps2)
     if found.size <= 0.0 or abs(found.size - 1.0) < SURE_SIGMAS * found.sigma_size:
         return None
     gravity = float(np.linalg.norm(found.gravity)) / gravity_mps2
     return found.size if 0.9 < gravity < 1.1 else None
+
+
+def by_neighbours(buffer: ImuBuffer, t_s: FloatArray, R: FloatArray, gyro_bias: FloatArray) -> FloatArray:
+    """Attitudes by the images of a second and the gyro between them, shape (n, 3, 3).
+
+    An image that shows the camera turned by an error shows it displaced by as much times the distance of the
+    target. Taken as it is, the error of the attitude would look like a lever arm that reaches to the target.
+
+    Args:
+        buffer: Inertial readings.
+        t_s: Instants, imu clock, s, shape (n,).
+        R: Attitudes by single images, shape (n, 3, 3).
+        gyro_bias: rad/s.
+    """
+    found = buffer.intervals(t_s)
+    if found is None:
+        return R
+    segment, begin = found
+    turned = products(over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin).dR[None])[0]
+    first = R @ np.swapaxes(turned, 1, 2)  # the attitude at the first instant, by each image
+    mean = nearest_rotation(first.mean(axis=0))
+    off = so3.log(first @ mean.T)
+    near = np.abs(t_s[:, None] - t_s) <= _NEAR_S
+    off = (near @ off) / near.sum(axis=1)[:, None]
+    return np.asarray(so3.exp(off) @ mean @ turned)
 
 
 def _poses_of_imu(
