@@ -231,7 +231,7 @@ class Calibrator:
                 continue
             if f.unobservable is not None:
                 self._initializer.take([(t_cam_s, frame)])
-                f.unobservable.follow(f)
+                f.unobservable.turned(f)
             now = f.plain()
             self._ask_held_back(now, report, frame, t_cam_s)
             self._note(now, report, frame, t_cam_s)
@@ -312,7 +312,9 @@ class Calibrator:
             return []
         if f.unobservable is not None:
             self._initializer.take([(t_cam_s, frame)])
-            f.unobservable.follow(f)
+            if f.unobservable.turned(f):
+                self.filter = None
+                return [report]
         self._trim(f.state.t_s)
         self._ask_held_back(f, report, frame, t_cam_s)
         if not f.finite():
@@ -324,7 +326,7 @@ class Calibrator:
             (_, camera, before_s), self._unproven = self._unproven, None
             step_s = f.state.cameras[camera].timeshift_s - before_s
             self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
-        if f.unobservable is None:  # with guesses nothing can be said of what else may be off
+        if f.unobservable is None:  # see `StatusEvaluator.saw_frame`
             for block, event in self._acceptance.look(f).items():
                 self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)

@@ -4,8 +4,8 @@ If an axis `a` of the imu keeps its direction R a in the world, a lever arm long
 back by `R a` give the same images. The lever arm along `a` is unobservable, and its assumed value changes
 nothing else. A filter that leaves it free sees `R a` in slightly different directions at each image and
 takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses while the estimate
-drifts off. So it is held, its variance is added to what is reported, and the first real turn of the axis
-releases it.
+drifts off. So it is held, its variance is added to what is reported, and the first real turn of the axis ends
+the filter: a lever arm that is held at a wrong value then moves all else.
 
 If the rig turns at one rate about one axis all the time, another delay is equivalent to another angle about
 that axis, with another direction of gravity, and a longer lever arm to another bias of the accelerometer. So
@@ -14,6 +14,7 @@ all of these are held until another motion allows a complete start.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import WINDOW_START
-from vical_daemon.estimation.model.state import POSITION, CameraSlices
-from vical_daemon.estimation.significance import EVERY_S
+from vical_daemon.estimation.model.state import CameraSlices
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -40,6 +40,7 @@ UNKNOWN_S = 0.3
 """Sigma of an unknown delay, s."""
 UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
 """Sigma of an unknown angle: all are equally likely."""
+_RECENT_S = 0.3  # of images by which an axis is seen to turn: 17 deg/s
 _HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6
 
 
@@ -57,7 +58,7 @@ class UnobservableDirections:
     turn_axis_cam: FloatArray | None = None
     _mean: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     _count: int = 0
-    _next_s: float = float("-inf")
+    _recent: deque[tuple[float, FloatArray]] = field(default_factory=deque)
 
     def hold(self, root: FloatArray, where: CameraSlices) -> None:
         """Make the sigmas of a filter that begins small where the motion shows nothing.
@@ -79,29 +80,20 @@ class UnobservableDirections:
             root[where.timeshift, where.timeshift] = _HELD_S
             root[where.skew, where.skew] = _HELD_SKEW
 
-    def follow(self, f: CalibrationFilter) -> None:
-        """Look at the filter after an image, and release what has turned by now."""
-        if self.turn_axis_cam is not None:
-            return
+    def turned(self, f: CalibrationFilter) -> bool:
+        """Look at the filter after an image: whether what is held turns now, so that it must not be held."""
+        R = f.state.R_world_imu
         self._count += 1
-        self._mean += (f.state.R_world_imu - self._mean) / self._count
-        if f.state.t_s < self._next_s:
-            return
-        self._next_s = f.state.t_s + EVERY_S
-        length = np.linalg.norm(self._mean @ self.axes.T, axis=0)
-        turned = 1.0 - length**2 > STILL_RAD**2
-        for axis in self.axes[turned]:
-            self._release(f, axis)
-        self.axes = self.axes[~turned]
-
-    @staticmethod
-    def _release(f: CalibrationFilter, axis: FloatArray) -> None:
-        column = np.zeros(f.layout.size)
-        column[POSITION] = -UNKNOWN_M * (f.state.R_world_imu @ axis)
-        for where in f.layout.cameras.values():
-            if where.position is not None:
-                column[where.position] = UNKNOWN_M * axis
-        f.inflate_covariance(column)
+        self._mean += (R - self._mean) / self._count
+        self._recent.append((f.state.t_s, R))
+        while self._recent[0][0] < f.state.t_s - _RECENT_S:
+            self._recent.popleft()
+        if self.turn_axis_cam is not None:
+            return False
+        usual = self._mean @ self.axes.T
+        usual = usual / np.linalg.norm(usual, axis=0)
+        now = sum(R for _, R in self._recent) / len(self._recent) @ self.axes.T
+        return bool((2.0 - 2.0 * (usual * now).sum(axis=0) > STILL_RAD**2).any())
 
     @property
     def projector(self) -> FloatArray:

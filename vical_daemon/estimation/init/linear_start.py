@@ -178,7 +178,7 @@ def drift_covariance(T: FloatArray, force_sigma: float) -> FloatArray:
     """
     near, far = np.minimum(T[:, None], T), np.maximum(T[:, None], T)
     density = force_sigma**2 * T[-1] / max(len(T) - 1, 1)
-    return density * near**2 * (3.0 * far - near) / 6.0
+    return np.asarray(density * near**2 * (3.0 * far - near) / 6.0)
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,7 @@ from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _STRETCH_S = 10.0
+_MOST_ARM_M = 0.1  # sigma of a lever arm from which a window still finds its way
 _NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
 
 
@@ -102,16 +104,20 @@ def motion_start(
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
         R, p, sigma, t = _poses_of_imu(inside, camera)
-        tilt_mps2 = options.gravity_mps2 * float(np.sqrt(np.mean(attitude_sigmas(inside, camera) ** 2)))
         axes: FloatArray | None = None
         if partial:
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
         R = by_neighbours(buffer, t, R, gyro_bias)
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
-        if motion is not None and may_resize and not partial:
-            other = other or _other_size(motion, p, sigma, tilt_mps2, options.gravity_mps2)
-        linear = None if motion is None else linear_start(motion, p, sigma, held_axes=axes, force_sigma=tilt_mps2)
-        if linear is None or (float(np.max(linear.sigma_p_imu_cam)) > 0.1 and not partial):
+        if motion is None:
+            return StartResult(None, f"{name}: inertial data do not cover its images", size=other)
+        solve = functools.partial(
+            linear_start, motion, p, sigma, force_sigma=options.gravity_mps2 * _rms(inside, camera)
+        )
+        if may_resize and not partial:
+            other = other or _other_size(solve(free_size=True), options.gravity_mps2)
+        linear = solve(held_axes=axes)
+        if float(np.max(linear.sigma_p_imu_cam)) > _MOST_ARM_M and not partial:
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
             return StartResult(None, why, motion_missing=True, size=other)
         if "extrinsics" not in options.fix:
@@ -128,16 +134,11 @@ def motion_start(
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used, size=other)
 
 
-def _other_size(
-    motion: LinearMotion, p: FloatArray, sigma: FloatArray, tilt_mps2: float, gravity_mps2: float
-) -> float | None:
+def _other_size(found: LinearStart, gravity_mps2: float) -> float | None:
     """Size of the target over the stated one, where positions and accelerations suggest another one.
 
-    Noise of the positions, which the size multiplies, and of the attitudes make it wrong by ten of its sigmas
-    where the rig moves slowly.
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
-    found = linear_start(motion, p, sigma, free_size=True, force_sigma=tilt_mps2)
     if found.size <= 0.0 or abs(found.size - 1.0) < SURE_SIGMAS * found.sigma_size:
         return None
     gravity = float(np.linalg.norm(found.gravity)) / gravity_mps2
@@ -160,7 +161,9 @@ def by_neighbours(buffer: ImuBuffer, t_s: FloatArray, R: FloatArray, gyro_bias: 
     if found is None:
         return R
     segment, begin = found
-    turned = products(over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin).dR[None])[0]
+    turned = products(over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin).dR[None])[
+        0
+    ]
     first = R @ np.swapaxes(turned, 1, 2)  # the attitude at the first instant, by each image
     mean = nearest_rotation(first.mean(axis=0))
     off = so3.log(first @ mean.T)
@@ -177,6 +180,11 @@ def _poses_of_imu(
     p = np.array([p.p_target_cam for p in poses])
     sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
     return R, p, sigma, np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
+
+
+def _rms(poses: list[TargetPose], camera: CameraState) -> float:
+    """Error to be expected of one attitude, rad."""
+    return float(np.sqrt(np.mean(attitude_sigmas(poses, camera) ** 2)))
 
 
 def _state_at(

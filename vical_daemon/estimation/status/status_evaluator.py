@@ -104,6 +104,8 @@ class StatusEvaluator(Evaluator):
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
+        if f.unobservable is not None:  # with guesses nothing can be said of what else may be off
+            return
         shared = f.shared[report.camera]
         self._announce_jitter(report.camera, shared.jitter_found_s)
         if shared.wander_px:

@@ -9,7 +9,6 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 
 from tests.unit.estimation.test_calibrator import calibrate, errors
-from vical_daemon.estimation.filter.snapshot import camera_estimate
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.result import Status
 
@@ -148,18 +147,41 @@ def test_a_rig_that_has_turned_at_one_rate_is_known_as_soon_as_it_turns_otherwis
     assert sigma[:3].max() < 3e-3
 
 
-def test_an_axis_that_begins_to_turn_is_released():
+@pytest.mark.parametrize(("turn_rad", "ends"), [(0.03, False), (0.2, True)])
+def test_an_axis_that_begins_to_turn_ends_a_filter_that_holds_it(turn_rad, ends):
     run = run_of(trajectory.pure_translation(4, T_imu_cam=MOUNT), seconds=10.0)
     f = calibrate(run).filter
     assert len(f.unobservable.axes) == 3
-    before = np.array(camera_estimate(f, "cam0", 0.0).T_imu_cam.covariance)[:3, :3]
-    for angle in np.linspace(0.0, 1.0, 2000):  # 57 degrees about z: x and y turn, z does not
-        f.state.R_world_imu = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() @ f.state.R_world_imu
+    still, ended = f.state.R_world_imu, []
+    for share in np.linspace(0.0, 1.0, 20):  # of a second
+        f.state.R_world_imu = Rotation.from_rotvec([0.0, 0.0, share * turn_rad]).as_matrix() @ still
         f.state.t_s += 0.05
-        f.unobservable.follow(f)
-    assert len(f.unobservable.axes) < 3
-    after = np.array(camera_estimate(f, "cam0", 0.0).T_imu_cam.covariance)[:3, :3]
-    assert np.linalg.eigvalsh(after - before).min() > -1e-6  # released, not made known
+        ended.append(f.unobservable.turned(f))
+    assert any(ended) == ends
+
+
+@pytest.mark.parametrize("seed", [8, 26])
+def test_a_rig_that_turns_after_a_long_translation_starts_at_once_and_rightly(seed):
+    """Errors of attitudes over 10 s of translation used to be taken for a lever arm of half a metre."""
+    hand = trajectory.hand_motion(seed, T_imu_cam=MOUNT)
+    turns = Paused(hand.rotation, [Pause(0.5, 14.0)])
+    base = hand.R_base_imu, hand.p_base_imu
+    run = run_of(trajectory.Trajectory(turns, hand.position, hand.R_world_base0, base), seed, seconds=18.0)
+    events, full_s, worst = [], [], 0.0
+
+    def look(c):
+        nonlocal worst
+        estimate = c.estimate()
+        events.extend(estimate.events)
+        if c.filter is not None and c.filter.unobservable is None:
+            full_s.append(1e-9 * (estimate.t_ns - int(run.t_imu_ns[0])))
+            x, sigma = errors(estimate, run)
+            worst = max(worst, float(np.abs(x / sigma).max()))
+
+    calibrate(run, each=look)
+    assert not events
+    assert full_s[0] < 16.0
+    assert worst < 5.0
 
 
 def test_still_axes_are_those_that_keep_their_direction():
