@@ -17,6 +17,10 @@ from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
+_GRAVITY = (
+    "gravity comes out as {:.2f} m/s^2 instead of {:.2f}: "
+    "check the target's size in its YAML and the unit of the accelerometer"
+)
 _STRETCH_S = 10.0
 _MOST_ARM_M = 0.1  # sigma of a lever arm from which a window still finds its way
 _NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
@@ -104,16 +108,15 @@ def motion_start(
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
         R, p, sigma, t = _poses_of_imu(inside, camera)
+        R = by_neighbours(buffer, t, R, gyro_bias)
         axes: FloatArray | None = None
         if partial:
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
-        R = by_neighbours(buffer, t, R, gyro_bias)
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
         if motion is None:
             return StartResult(None, f"{name}: inertial data do not cover its images", size=other)
-        solve = functools.partial(
-            linear_start, motion, p, sigma, force_sigma=options.gravity_mps2 * _rms(inside, camera)
-        )
+        tilt_mps2 = options.gravity_mps2 * _attitude_sigma(inside, camera)
+        solve = functools.partial(linear_start, motion, p, sigma, force_sigma=tilt_mps2)
         if may_resize and not partial:
             other = other or _other_size(solve(free_size=True), options.gravity_mps2)
         linear = solve(held_axes=axes)
@@ -126,11 +129,7 @@ def motion_start(
             size, still = float(np.linalg.norm(linear.gravity)), axes
             state = _state_at(inside[0], camera, linear, gyro_bias, cameras, options)
     if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
-        why = (
-            f"gravity comes out as {size:.2f} m/s^2 instead of {options.gravity_mps2:.2f}: "
-            "check the target's size in its YAML and the unit of the accelerometer"
-        )
-        return StartResult(None, why, size=other)
+        return StartResult(None, _GRAVITY.format(size, options.gravity_mps2), size=other)
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used, size=other)
 
 
@@ -182,7 +181,7 @@ def _poses_of_imu(
     return R, p, sigma, np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
 
 
-def _rms(poses: list[TargetPose], camera: CameraState) -> float:
+def _attitude_sigma(poses: list[TargetPose], camera: CameraState) -> float:
     """Error to be expected of one attitude, rad."""
     return float(np.sqrt(np.mean(attitude_sigmas(poses, camera) ** 2)))
 
