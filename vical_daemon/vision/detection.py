@@ -30,22 +30,39 @@ class Detection:
     sigma_px: FloatArray | None = None
 
 
+_TO_GRAY = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}  # by channels
+_CLIPPED = 0.002
+"""Share of the pixels: 600 of 640 x 480. A lamp is smaller, the white of a board is larger."""
+_EVERY = 4  # rows and columns: 19 200 pixels of 640 x 480 tell the brightness
+
+
 def as_gray(image: AnyImage) -> Gray:
-    """Return the picture as 8-bit grey: BGR is mixed, 16 bit is scaled by its own brightest pixel.
+    """Return the picture as 8-bit grey: BGR is mixed, an alpha channel is left out, 16 bit is `stretched`.
 
     Raises:
-        ValueError: The shape is neither (h, w) nor (h, w, 3), or the type is not uint8 or uint16.
+        ValueError: The shape is neither (h, w) nor (h, w, 3 or 4), or the type is not uint8 or uint16.
     """
-    if image.ndim == 3 and image.shape[2] == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.ndim == 3 and image.shape[2] in _TO_GRAY:
+        image = cv2.cvtColor(image, _TO_GRAY[image.shape[2]])
     if image.ndim != 2:
-        raise ValueError(f"image of shape {image.shape}: expected (height, width) or (height, width, 3)")
+        raise ValueError(f"image of shape {image.shape}: expected (height, width) or (height, width, 3 or 4)")
     if image.dtype == np.uint16:
-        brightest = max(int(image.max()), 1)
-        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0 / brightest), np.uint8)
+        return stretched(np.asarray(image, np.uint16))
     if image.dtype != np.uint8:
         raise ValueError(f"image of type {image.dtype}: expected uint8 or uint16")
     return np.ascontiguousarray(image, np.uint8)
+
+
+def stretched(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+    """Return a picture of 16 bit in 8, shape as given.
+
+    The darkest and the brightest share of `_CLIPPED` become black and white: a lamp, a reflection or a hot
+    pixel would leave a board a few grey levels, as would the offset of a thermal camera.
+    """
+    some = image[::_EVERY, ::_EVERY]
+    low, high = np.quantile(some, [_CLIPPED, 1.0 - _CLIPPED], method="nearest").tolist()
+    levels = np.clip(image, low, high) - np.uint16(low)
+    return np.asarray(cv2.convertScaleAbs(levels, alpha=255.0 / max(high - low, 1)), np.uint8)
 
 
 def sample(image: npt.NDArray[np.float32], uv_px: FloatArray) -> FloatArray:

@@ -221,7 +221,11 @@ def thinned(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
     """Return an image of at most `WIDTH_LIMIT` columns and 8 bits, and the step between the pixels taken."""
     factor = -(-pixels.shape[1] // WIDTH_LIMIT)
     small = np.ascontiguousarray(pixels[::factor, ::factor])
-    return ((small >> 8).astype(np.uint8) if small.dtype == np.uint16 else small), factor
+    if small.dtype == np.uint16:
+        from vical_daemon.vision.detection import stretched
+
+        small = stretched(small)
+    return small, factor
 
 
 def _stamp_ns(sample: Sample) -> int:

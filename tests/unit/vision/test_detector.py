@@ -181,9 +181,11 @@ def test_another_board_is_not_taken_for_ours(film, aprilgrid):
 
 def test_colour_and_sixteen_bit_pictures(film, aprilgrid):
     image = film(aprilgrid, 1.2).render(0.0)
-    colour = np.repeat(image[:, :, None], 3, axis=2)
+    colour, alpha = (np.repeat(image[:, :, None], n, axis=2) for n in (3, 4))
     deep = image.astype(np.uint16) * 16
-    for picture in (colour, deep):
+    lamp, thermal = deep // 4, deep // 8 + 29000  # a lamp 64 times as bright as the board; 0.01 K a level
+    lamp[:12, :12] = 65535
+    for picture in (colour, alpha, deep, lamp, thermal):
         assert len(BoardDetector(aprilgrid).detect(picture).ids) > 130
     with pytest.raises(ValueError, match="expected"):
         as_gray(image.astype(np.float32))

@@ -366,9 +366,11 @@ def test_a_clock_that_goes_back_does_not_stop_the_picture(web_feed):
 
 
 def test_marks_at_the_border_and_other_depths():
-    small, factor = thinned(np.full((20, 30), 40000, dtype=np.uint16))
-    picture = colour(small)
+    ten_bit = np.repeat(np.array([40, 1023], dtype=np.uint16), 300).reshape(20, 30)
+    small, factor = thinned(ten_bit)
     assert factor == 1
+    assert small[0, 0] == 0 and small[-1, -1] == 255  # of 65535 it would be black
+    picture = colour(np.full((20, 30), 156, dtype=np.uint8))
     assert picture[0, 0].tolist() == [156] * 3
     shape = np.array([[0, 0], [1, 1]])
     draw(picture, np.array([[0.0, 0.0], [29.4, 19.6], [-50.0, 4.0], [1e300, 4.0]]), shape, (1, 2, 3))

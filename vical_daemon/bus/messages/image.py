@@ -20,6 +20,8 @@ _ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
     "bgr8": ("u1", 3), "rgb8": ("u1", 3), "8UC3": ("u1", 3), "bgra8": ("u1", 4), "rgba8": ("u1", 4),
     "bayer_rggb8": ("u1", 1), "bayer_bggr8": ("u1", 1), "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
+    "bayer_rggb16": ("u2", 1), "bayer_bggr16": ("u2", 1), "bayer_gbrg16": ("u2", 1),
+    "bayer_grbg16": ("u2", 1), "rgb16": ("u2", 3), "bgr16": ("u2", 3),
 }  # fmt: skip
 _LUMINANCE = {"yuyv": 0, "yuv422_yuy2": 0, "uyvy": 1, "yuv422": 1}
 """Formats of two bytes a pixel: which of them is its luminance (ROS 2, image_encodings.hpp)."""
@@ -55,7 +57,8 @@ class ImageMessage:
     def pixels(self) -> npt.NDArray[Any]:
         """Return the image, shape (height, width) or (height, width, channels); a read-only view.
 
-        Of YUV 4:2:2 it is the luminance, as a copy.
+        Of YUV 4:2:2 it is the luminance, and 16-bit pixels have the byte order of this computer; those are
+        copies.
 
         Raises:
             MessageError: A pixel format that this program does not know.
@@ -73,6 +76,8 @@ class ImageMessage:
             )
         rows = np.frombuffer(self.data, dtype).reshape(self.height, self.step // dtype.itemsize)
         image = rows[:, : self.width * channels]
+        if not dtype.isnative:
+            image = image.astype(dtype.newbyteorder("="))
         return image if channels == 1 else image.reshape(self.height, self.width, channels)
 
 
