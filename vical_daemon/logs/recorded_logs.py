@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from abc import abstractmethod
@@ -44,6 +45,8 @@ from vical_daemon.logs.model import (
     merged,
     stream_statistics,
 )
+from vical_daemon.logs.stamp_column import coarseness
+from vical_daemon.logs.united_imu import forces_at, lacks
 
 _KIND_OF_TYPE: dict[str, Kind] = {
     IMU_TYPE: "imu",
@@ -101,6 +104,7 @@ class _Channel:
     unreadable: int = 0
     problem: str = ""  # why the first one was unreadable
     even_ns: IntArray | None = None  # of each of `stamps` the one to use instead
+    forces: FloatArray | None = None  # of each of `stamps`, from another topic; NaN where there is none
 
 
 class LogRecording(Recording):
@@ -131,11 +135,14 @@ class LogRecording(Recording):
         self._order = OutOfReach()
         self._scan()
         self._scanned = True
+        for channel in self._channels.values():
+            self._note_steps(channel)
         if not as_recorded:
             for channel in self._channels.values():
                 if channel.kind == "imu":
                     self._even(channel)
             self._even_cameras()
+        self._unite()
         self.streams = tuple(
             self._stream(topic, channel) for topic, channel in self._channels.items() if len(channel.stamps)
         )
@@ -201,6 +208,14 @@ class LogRecording(Recording):
             free, number = f"{name}_{number}", number + 1
         return free
 
+    def _note_steps(self, channel: _Channel) -> None:
+        """Note by how much all stamps may be off together as they are rounded."""
+        report, sigma_s = coarseness(_stamps(channel))
+        if report:
+            self.warnings.append(f"{channel.name}: {report}")
+        if sigma_s:
+            self.stamp_sigma_s[channel.name] = sigma_s
+
     def _even(self, channel: _Channel) -> None:
         """Put readings that were stamped on arrival on an even grid."""
         stamps, values = np.array(channel.stamps, dtype=np.int64), _values(channel)
@@ -209,8 +224,27 @@ class LogRecording(Recording):
         even = even_stamps(stamps, values[:, :3])
         if even is not None:
             self.warnings.append(even.describe(channel.name))
-            self.stamp_sigma_s[channel.name] = even.sigma_s
+            self.stamp_sigma_s[channel.name] = math.hypot(
+                self.stamp_sigma_s.get(channel.name, 0.0), even.sigma_s
+            )
             channel.even_ns = even.t_ns
+
+    def _unite(self) -> None:
+        """Give a gyro without an accelerometer the readings of an accelerometer that has no gyro."""
+        imus = {t: c for t, c in self._channels.items() if c.kind == "imu" and c.stamps}
+        lacking = {topic: lacks(_values(channel)) for topic, channel in imus.items()}
+        gyros, accels = ([t for t, x in lacking.items() if x == y] for y in ("accelerometer", "gyro"))
+        if len(gyros) != 1 or len(accels) != 1:
+            return
+        gyro, accel = self._channels[gyros[0]], self._channels.pop(accels[0])
+        self._others[accels[0]] = IMU_TYPE
+        values = _values(gyro).copy()
+        values[:, 3:] = forces_at(_stamps(gyro), _stamps(accel), _values(accel)[:, 3:])
+        gyro.forces = values[:, 3:]
+        gyro.values = bytearray(values.tobytes())
+        self.warnings.append(
+            f"{gyro.name}: has no accelerometer; that of {accel.name} is used, interpolated to its stamps"
+        )
 
     def _even_cameras(self) -> None:
         """Put images that were stamped on arrival on the even grid of their camera."""
@@ -227,7 +261,7 @@ class LogRecording(Recording):
             even = stamps.even()
             if even is not None:
                 self.warnings.append(even.describe(name, "images"))
-                self.stamp_sigma_s[name] = even.sigma_s
+                self.stamp_sigma_s[name] = math.hypot(self.stamp_sigma_s.get(name, 0.0), even.sigma_s)
                 better = dict(zip(stamps.t_ns.tolist(), even.t_ns.tolist(), strict=True))
                 for _, c in of_it:
                     c.even_ns = np.array([better.get(t, t) for t in c.stamps], dtype=np.int64)
@@ -262,12 +296,18 @@ class LogRecording(Recording):
             if stamp_ns is None:
                 continue
             payload, channel = raw.payload, self._channels.get(raw.topic)
-            if channel is not None and channel.even_ns is not None:
+            if channel is not None and (channel.even_ns is not None or channel.forces is not None):
                 if channel.kind == "imu" and not _has_imu_size(payload):
                     continue
-                stamp_ns = int(channel.even_ns[rows[raw.topic]])
+                row = rows[raw.topic]
                 rows[raw.topic] += 1
-                payload = b"".join([payload[:4], _STAMP.pack(*divmod(stamp_ns, 10**9)), payload[12:]])
+                if channel.even_ns is not None:
+                    stamp_ns = int(channel.even_ns[row])
+                    payload = with_stamp(payload, stamp_ns)
+                if channel.forces is not None:
+                    if np.isnan(channel.forces[row, 0]):
+                        continue
+                    payload = with_force(payload, channel.forces[row].tobytes())
             yield Stamped(stamp_ns, raw.log_time_ns, *wanted[raw.topic], payload)
 
     def imu_arrays(self, name: str) -> ImuArrays:

@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import IntArray
-from vical_daemon.logs.stamps import UNIT_WORDS, resolution_ns, to_ns, unit_by_spacing, unit_named
+from vical_daemon.logs.stamps import (
+    UNIT_WORDS,
+    resolution_ns,
+    rounded_to_ns,
+    to_ns,
+    unit_by_spacing,
+    unit_named,
+)
 
 _IMU_HZ = (5.0, 20_000.0, 200.0)
 """Slowest, fastest and typical rate, Hz: a gyro below 10 Hz is of no use; the fastest MEMS IMUs give 32 kHz
@@ -28,8 +35,9 @@ class StampColumn(NamedTuple):
     Attributes:
         t_ns: In ns, shape (n,).
         report: On their unit; empty where they are nanoseconds.
-        sigma_s: By how much all may be off together as they are written in steps of their last digit, s: one
-            step over the root of 12 (GUM, JCGM 100:2008, F.2.2.1). 0 where that is a nanosecond.
+        sigma_s: By how much all may be off together as they are written in steps of their last digit (that is
+            not always zero), s: one step over the root of 12 (GUM, JCGM 100:2008, F.2.2.1). 0 where that is
+            a nanosecond.
     """
 
     t_ns: IntArray
@@ -55,18 +63,29 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
     if isinstance(values, np.ndarray):
         distinct: list[int] = np.unique(values).tolist()
         unit = unit_by_spacing(distinct, slowest, fastest, usual)
-        if unit == "ns":
-            return StampColumn(values, "", 0.0)
     else:
         unit = unit_by_spacing(values, slowest, fastest, usual)
     named = unit_named(title.split(",")[0])
     if named is not None and named != "ns" and unit != "ns":
         unit = named
-    listed = values.tolist() if isinstance(values, np.ndarray) else values
-    step_ns = resolution_ns(listed, unit)
-    report = "" if unit == "ns" else f"by their spacing the stamps are {UNIT_WORDS[unit]}; read as such"
-    if step_ns >= _COARSE_NS:
-        coarse = f"stamps are written in steps of {1e-6 * step_ns:g} ms, which limits the time shift"
-        report = f"{report}; {coarse}" if report else coarse
-    sigma_s = 1e-9 * step_ns / np.sqrt(12.0) if step_ns > 1.0 else 0.0
-    return StampColumn(to_ns(listed, unit), report, float(sigma_s))
+    if isinstance(values, np.ndarray) and unit == "ns":
+        t_ns, step_ns = values, 1.0
+    else:
+        listed = values.tolist() if isinstance(values, np.ndarray) else values
+        t_ns, step_ns = to_ns(listed, unit), resolution_ns(listed, unit)
+    coarse, sigma_s = coarseness(t_ns, step_ns)
+    read_as = "" if unit == "ns" else f"by their spacing the stamps are {UNIT_WORDS[unit]}; read as such"
+    return StampColumn(t_ns, "; ".join(filter(None, [read_as, coarse])), sigma_s)
+
+
+def coarseness(t_ns: IntArray, step_ns: float = 1.0) -> tuple[str, float]:
+    """Return (report, sigma_s) of stamps that are written in steps, see `StampColumn`.
+
+    Args:
+        t_ns: Stamps, ns, in any order.
+        step_ns: Value of the last digit that they were written with, ns.
+    """
+    step_ns = max(step_ns, rounded_to_ns(t_ns))
+    report = f"stamps are written in steps of {1e-6 * step_ns:g} ms, which limits the time shift"
+    sigma_s = 1e-9 * step_ns / 12.0**0.5 if step_ns > 1.0 else 0.0
+    return report if step_ns >= _COARSE_NS else "", sigma_s

@@ -72,6 +72,26 @@ def resolution_ns(values: list[int] | list[Decimal], unit: str) -> float:
     return FACTOR_NS[unit] * 10.0 ** int(finest)
 
 
+def rounded_to_ns(t_ns: IntArray) -> int:
+    """Return the power of ten, ns, of which all stamps are multiples: a program rounded them to it.
+
+    1 where all intervals are multiples of the shortest: a simulation, or nothing that shows a rounding.
+
+    >>> rounded_to_ns(np.array([0, 2_000_000, 5_000_000, 7_000_000]))
+    1000000
+    >>> rounded_to_ns(np.array([0, 5_000_000, 10_000_000, 20_000_000]))
+    1
+    """
+    distinct = np.unique(t_ns)
+    steps = np.diff(distinct)
+    if len(steps) < 2 or (steps % steps.min() == 0).all():
+        return 1
+    step_ns = 1
+    while step_ns < FACTOR_NS["s"] and (distinct % (10 * step_ns) == 0).all():
+        step_ns *= 10
+    return step_ns
+
+
 def unit_named(title: str) -> str | None:
     """Return the unit that the title of a column names: `timestamp [ns]`, `time_us`; None: none.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,14 @@ import pytest
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from vical_mocks.harness.asl import write_asl as write_run
+from vical_mocks.points import simulate
 
 from vical_daemon.bus.messages import POINTS_TYPE
 from vical_daemon.bus.messages.schemas import DEFINITIONS
 from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.recorded_logs import stamp_of
 
 
 def test_files_of_another_camera_are_not_looked_at(tmp_path, write_asl):
@@ -258,6 +263,39 @@ def test_gravity_removed_is_not_taken_for_g(tmp_path, write_asl, a_motion):
     folder = write_asl(tmp_path / "a", imu=(t_ns, gyro, rng.normal(0.0, 0.8, force.shape)))
     with pytest.raises(RecordingError, match="gravity seems to be removed"):
         open_recording(folder)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_gravity_removed_from_motion_that_never_stops_is_not_taken_for_g(tmp_path, seed):
+    """The readings of a rig that is always accelerated may well have the size of 1 g in g."""
+    run = simulate(seed, 10.0)
+    t_s = (run.t_imu_ns - run.options.epoch_ns) * 1e-9
+    moved = run.rig.trajectory
+    without = np.einsum("nji,nj->ni", moved.R_world_imu(t_s), moved.a_world_imu(t_s))
+    in_g = run.specific_force_mps2 / 9.80665
+    for name, force, says in (("a", without, "gravity seems to be removed"), ("b", in_g, "looks like g")):
+        folder = write_run(tmp_path / name, replace(run, specific_force_mps2=force))
+        with pytest.raises(RecordingError, match=says):
+            open_recording(folder)
+
+
+@pytest.mark.parametrize("kind", ["folder", "log"])
+@pytest.mark.parametrize("hz", [200.0, 400.0])
+def test_stamps_rounded_to_a_millisecond_leave_the_time_shift_uncertain(tmp_path, hz, kind):
+    """A program may write rounded stamps as ns. Evenly spaced ones are as good as the clock behind them."""
+    run = simulate(1, 10.0, imu_rate_hz=hz, epoch_ns=10**18)
+    ms = 10**6
+    rounded = replace(run, t_imu_ns=(run.t_imu_ns + ms // 2) // ms * ms)
+    path = write_run(tmp_path / "a", rounded)
+    if kind == "log":
+        with LogWriter(tmp_path / "a.mcap") as writer:
+            for key, payload in open_recording(path, as_recorded=True).messages():
+                writer.write(key, payload, stamp_of(payload))
+        path = tmp_path / "a.mcap"
+    recording = open_recording(path)
+    uncertain = hz == 400.0  # 2.5 ms become 2 and 3 ms
+    assert any("imu0: stamps are written in steps of 1 ms" in w for w in recording.warnings) == uncertain
+    assert recording.stamp_sigma_s.get("imu0", 0.0) == pytest.approx(1e-3 / 12**0.5 if uncertain else 0.0)
 
 
 def test_an_axis_that_is_not_read_is_named(tmp_path, write_asl, a_motion):
