@@ -1,7 +1,7 @@
 """Priors of the estimator, from the config or from Kalibr's files.
 
 Kalibr's camchain.yaml (`cam0: intrinsics, T_cam_imu, timeshift_cam_imu, ...`) and imu.yaml keys, at the top
-level or under `imu0`; every key is optional.
+level or under `imu0`, and OpenVINS's variants of both; every key is optional.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ class _KalibrCamera:
     intrinsics_sigma: tuple[Sigma, Sigma, Sigma, Sigma] | None = None
     distortion_sigma: tuple[Sigma, ...] | None = None
     T_cam_imu: Matrix4 | None = None
+    T_imu_cam: Matrix4 | None = None  # OpenVINS
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     line_delay: Annotated[float, Bound(low=0, high=1e-3, hint="seconds a line")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] | None = None
@@ -67,6 +68,13 @@ class _KalibrImu:
     time_offset: float | None = None
 
 
+_RESULTS_OF_IMU = (
+    *("Tw", "Ta", "Tg", "R_IMUtoGYRO", "R_IMUtoACC", "R_GYROtoIMU", "R_ACCtoIMU"),  # OpenVINS
+    *("accelerometers", "gyroscopes"),  # Kalibr
+)
+"""Keys with matrices of the IMU: no prior, they are found from the data."""
+
+
 @dataclass(frozen=True, slots=True)
 class Initial:
     """Contents of an `--initial` file.
@@ -91,6 +99,10 @@ def read_initial(path: Path | str) -> Initial:
     document = read(Path(path))
     cameras: dict[str, CameraPrior] = {}
     imu: _KalibrImu | None = None
+    sections = [document.root, *(value for value in document.root.values() if isinstance(value, dict))]
+    for section in sections:
+        for key in _RESULTS_OF_IMU:
+            section.pop(key, None)
     loose: dict[str, Value] = {
         key: value for key, value in document.root.items() if not isinstance(value, dict)
     }
@@ -158,8 +170,12 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         raise ConfigError(schema.mistake(document, f"{name}.distortion_coeffs", text))
     if camera.distortion_sigma is not None and (text := coefficients_error(model, camera.distortion_sigma)):
         raise ConfigError(schema.mistake(document, f"{name}.distortion_sigma", text))
-    if camera.T_cam_imu is not None and (text := rigid_error(camera.T_cam_imu)):
-        raise ConfigError(schema.mistake(document, f"{name}.T_cam_imu", text))
+    for key, matrix in (("T_cam_imu", camera.T_cam_imu), ("T_imu_cam", camera.T_imu_cam)):
+        if matrix is not None and (text := rigid_error(matrix)):
+            raise ConfigError(schema.mistake(document, f"{name}.{key}", text))
+    if camera.T_cam_imu and camera.T_imu_cam:
+        text = "T_cam_imu is given, too; one is the inverse of the other: remove one"
+        raise ConfigError(schema.mistake(document, f"{name}.T_imu_cam", text))
     resolution = camera.resolution or (0, 0)
     readout_s = camera.readout_s or (camera.line_delay or 0.0) * resolution[camera.readout_axis != "columns"]
     return CameraPrior(
@@ -167,7 +183,7 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         intrinsics=camera.intrinsics,
         distortion_model=model,
         distortion=coefficients,
-        T_imu_cam=_inverse(camera.T_cam_imu),
+        T_imu_cam=_inverse(camera.T_cam_imu) or _pose(camera.T_imu_cam),
         timeshift_cam_imu_s=camera.timeshift_cam_imu,
         readout_s=readout_s,
         readout_axis=camera.readout_axis or "",
@@ -188,11 +204,19 @@ def _noise(imu: _KalibrImu) -> tuple[ImuNoise, float | None]:
     return noise, rate_hz
 
 
-def _inverse(T_cam_imu: Matrix4 | None) -> tuple[FloatArray, FloatArray] | None:
-    """Turn Kalibr's T_cam_imu into (R_imu_cam, p_imu_cam); the rotation is made exactly orthonormal."""
-    if T_cam_imu is None:
+def _pose(T_imu_cam: Matrix4 | None) -> tuple[FloatArray, FloatArray] | None:
+    """Turn a matrix into (R_imu_cam, p_imu_cam); the rotation is made exactly orthonormal."""
+    if T_imu_cam is None:
         return None
-    T = np.asarray(T_cam_imu, dtype=np.float64)
+    T = np.asarray(T_imu_cam, dtype=np.float64)
     U, _, Vt = np.linalg.svd(T[:3, :3])
-    R_imu_cam = (U @ Vt).T
-    return R_imu_cam, -R_imu_cam @ T[:3, 3]
+    return U @ Vt, T[:3, 3]
+
+
+def _inverse(T_cam_imu: Matrix4 | None) -> tuple[FloatArray, FloatArray] | None:
+    """Turn Kalibr's T_cam_imu into (R_imu_cam, p_imu_cam), see `_pose`."""
+    pose = _pose(T_cam_imu)
+    if pose is None:
+        return None
+    R_cam_imu, p_cam_imu = pose
+    return R_cam_imu.T, -R_cam_imu.T @ p_cam_imu

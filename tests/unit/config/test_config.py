@@ -240,6 +240,20 @@ class TestInitial:
         assert cam0.readout_s == pytest.approx(0.01) and cam0.timeshift_cam_imu_s == -0.012
         assert initial.cameras["cam1"].distortion is None and initial.imu_noise is None
 
+    def test_openvins_files(self, tmp_path: Path) -> None:
+        """OpenCV's first line, the inverse of Kalibr's pose, and matrices of the IMU."""
+        rows = "[[0, 0, 1, 0.5], [-1, 0, 0, 0.25], [0, -1, 0, 0.125], [0, 0, 0, 1]]"
+        camera = self.read(tmp_path, f"%YAML:1.0\n\ncam0:\n  T_imu_cam: {rows}\n  camera_model: pinhole\n")
+        R_imu_cam, p_imu_cam = camera.cameras["cam0"].T_imu_cam or (None, None)
+        assert p_imu_cam is not None and p_imu_cam.tolist() == [0.5, 0.25, 0.125]
+        np.testing.assert_allclose(R_imu_cam, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-15)
+        text = "%YAML:1.0\n\nimu0:\n  gyroscope_noise_density: 2e-4\n  Tw: [[1, 0], [0, 1]]\n  R_IMUtoGYRO: [[1]]\n"
+        noise = self.read(tmp_path, text).imu_noise
+        assert noise is not None and noise.gyro_density == 2e-4
+        both = f"cam0: {{T_imu_cam: {rows}, T_cam_imu: {rows}}}\n"
+        with pytest.raises(ConfigError, match=r"cam0\.T_imu_cam: T_cam_imu is given, too.* line 1"):
+            self.read(tmp_path, both)
+
     def test_kalibr_imu_yaml_at_the_top_level(self, tmp_path: Path) -> None:
         initial = self.read(
             tmp_path,
