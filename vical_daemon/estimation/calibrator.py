@@ -39,7 +39,7 @@ from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
-from vical_daemon.estimation.status.what_jumped import Part, what_jumped
+from vical_daemon.estimation.status.what_jumped import Part, lens_stepped, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
@@ -351,8 +351,7 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        changed = action in (Action.POSE, Action.RESTART)
-        if changed and self._unproven is None and self._clock_changed(f, frame.camera):
+        if action in (Action.POSE, Action.RESTART) and self._part_changed(f, frame.camera):
             return
         if action is Action.POSE:
             self._lose_motion()
@@ -365,18 +364,17 @@ class Calibrator:
         elif action is Action.RESTART:
             self._restart(f)
 
-    def _clock_changed(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images disagree because of the camera's clock; then go on with that alone unknown.
-
-        Asked of the calibration from before: images since have moved the present one, above all its lens.
-        """
+    def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
+        """See whether images disagree because of a camera's clock or lens; go on with that alone unknown."""
         assert self._buffer is not None
         if self.rig.layout.cameras[camera].timeshift is None or f.unobservable is not None:
             return False
-        before = self._past.filter(f)
+        before = self._past.filter(f)  # images since have moved the present one, above all its lens
+        if self._unproven is not None:
+            return self._part_jumped(before, camera)
         fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
-            return self._clock_jumped(before, camera)
+            return self._part_jumped(before, camera)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
@@ -385,14 +383,17 @@ class Calibrator:
         self._lose_motion()
         return True
 
-    def _clock_jumped(self, before: CalibrationFilter, camera: str) -> bool:
-        """See whether a step that orientations do not show, or another rate, explains the images best."""
+    def _part_jumped(self, before: CalibrationFilter, camera: str) -> bool:
+        """See whether a step that orientations do not show, another rate or lens explains the images best."""
         part, f = what_jumped(before, self._past.since(before), camera, self._step)
-        if part in (Part.NONE, Part.MOUNTING):
+        if part in (Part.NONE, Part.MOUNTING) or (self._unproven is not None and part is not Part.LENS):
             return False
         self.filter = f
         if part is Part.DRIFT:
             self.evaluator.announce(clock_drift.let_drift(f, camera, anew=True), once=f"wander {camera}")
+        elif part is Part.LENS:
+            self._unproven = None
+            self.evaluator.announce(lens_stepped(before, f, camera))
         else:
             self._unproven = (f.state.t_s + _STANDS_S, camera, before.state.cameras[camera].timeshift_s)
         self.watch.shift_reopened()

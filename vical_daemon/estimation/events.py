@@ -25,6 +25,7 @@ class EventKind(StrEnum):
     LENS_CHANGED = "lens_changed"
     STORED_HOLDS = "stored_holds"
     TIMESHIFT_STEPPED = "timeshift_stepped"
+    LENS_STEPPED = "lens_stepped"
     POSE_LOST = "pose_lost"
     CLOCK_DRIFT = "clock_drift"
     CLOCK_WANDER = "clock_wander"
@@ -124,6 +125,7 @@ _CHANGES = frozenset(
         EventKind.CAMERA_TURNED,
         EventKind.TIMESHIFT_CHANGED,
         EventKind.LENS_CHANGED,
+        EventKind.LENS_STEPPED,
     }
 )
 
@@ -225,6 +227,13 @@ REFERENCE: dict[EventKind, About] = {
         "The time shift jumped; everything else is kept. Value: new minus old.",
         "s",
         "When images have agreed with the new time shift for 3 s; target-free for 2 s.",
+    ),
+    EventKind.LENS_STEPPED: About(
+        "The lens changed at once: focus or zoom was turned, or focuses by itself. It is estimated again; "
+        "everything else is kept. Value: focal length fx, new minus old.",
+        "px",
+        "With a board and a lens that is not fixed: when images no longer fit, and another lens explains "
+        "them far better than a bump.",
     ),
     EventKind.POSE_LOST: About(
         "The pose was lost and is taken from the images again; the calibration is kept.",

@@ -346,6 +346,13 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         "",
         lambda e: f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept",
     ),
+    EventKind.LENS_STEPPED: (
+        "",
+        lambda e: (
+            f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
+            "it is estimated again, all else is kept"
+        ),
+    ),
     EventKind.POSE_LOST: ("", lambda _: "pose lost, and re-initialised from the images"),
     EventKind.CLOCK_DRIFT: (
         "",

@@ -19,7 +19,7 @@ from vical_daemon.offline.calibration_job import Job
 
 AGREES, DISAGREES, CANNOT_TELL = "agrees", "disagrees", "cannot tell"
 _NO_RESULT = (Status.WAITING, Status.INITIALISING, Status.INCONSISTENT)
-_CHANGES = (EventKind.BUMPED, EventKind.TIMESHIFT_STEPPED)
+_CHANGES = (EventKind.BUMPED, EventKind.TIMESHIFT_STEPPED, EventKind.LENS_STEPPED)
 
 
 @dataclass(slots=True)

@@ -228,7 +228,7 @@ class CalibrationFilter:
             fit.dof,
             median(image.sigma_px) * fit.noise,
             predicted_px=predicted,
-            log_likelihood=log_likelihood(fit, len(keep) - int(keep.sum())),
+            log_likelihood=log_likelihood(fit, image),
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
@@ -277,7 +277,7 @@ class CalibrationFilter:
             *(image.t_ns, image.camera, image.ids, image.uv, residual, none, False),
             reason=why,
             predicted_px=predicted,
-            log_likelihood=log_likelihood(None, 0),
+            log_likelihood=log_likelihood(None, image),
         )
 
     def prediction_nis(self, image: Image) -> float | None:

@@ -67,17 +67,21 @@ class ImageFit:
     noise: float
 
 
-def log_likelihood(fit: ImageFit | None, refused: int) -> float:
+def log_likelihood(fit: ImageFit | None, image: Image) -> float:
     """Of an image, by its innovation, up to a constant: what is refused counts as if it were at its gate.
+
+    Filters whose noise of corners has grown differently can be compared: its logarithm is counted.
 
     Args:
         fit: Its correction; None: it was refused.
-        refused: Corners that did not take part.
+        image: With its noise.
     """
+    noise = 2.0 * float(np.log(image.sigma_px).sum())
     if fit is None:
-        return -0.5 * frame_limit(_POSE)
-    squares, rows = fit.nis + fit.rest / fit.noise**2, 2 * int(np.count_nonzero(fit.keep))
-    return -0.5 * (squares + fit.log_det - rows + refused * _CORNER_GATE) - rows * math.log(fit.noise)
+        return -0.5 * frame_limit(_POSE) - noise
+    kept = int(np.count_nonzero(fit.keep))
+    squares = fit.nis + fit.rest / fit.noise**2 + (len(fit.keep) - kept) * _CORNER_GATE
+    return -0.5 * (squares + fit.log_det - 2 * kept) - 2 * kept * math.log(fit.noise) - noise
 
 
 def rows_of(keep: BoolArray) -> BoolArray | slice:
