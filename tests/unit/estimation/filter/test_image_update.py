@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.filter.image_update import blurred, solve
+from vical_daemon.estimation.filter.image_update import blurred, log_likelihood, solve
 from vical_daemon.estimation.filter.linearise import Image, Linear
 
 POINTS, STATES = 6, 3
@@ -48,3 +48,23 @@ def test_a_blurred_image_is_known_from_a_moved_one():
     assert blurred(image, 5.0 * white + moved, lin) == pytest.approx(5.0, rel=0.2)
     wrong = moved + 200.0 * rng.standard_normal((n, 2))  # corners of something else
     assert blurred(image, wrong, lin) == 1.0
+
+
+def test_the_likelihood_of_an_image_counts_its_corner_noise():
+    """Against the density of the innovation: filters with different noise of corners can be compared."""
+    rng = np.random.default_rng(5)
+    ways = rng.standard_normal((2 * POINTS, STATES))
+    uv = (ways @ rng.standard_normal(STATES)).reshape(-1, 2) + 0.2 * rng.standard_normal((POINTS, 2))
+    none, seen = np.zeros((2 * POINTS, 0)), np.ones(POINTS, bool)
+    lin = Linear(
+        np.zeros((POINTS, 2)), ways, np.eye(STATES), np.eye(STATES), none, seen, np.zeros((STATES, 0))
+    )
+    off = []
+    for sigma in (0.1, 0.2, 2.0):
+        image = Image("cam0", 0, 0.0, np.arange(POINTS), np.zeros((POINTS, 3)), uv, np.full(POINTS, sigma))
+        fit = solve(image, np.eye(STATES), lin, seen, lambda *_: lin)
+        assert fit.keep.all()
+        V = ways @ ways.T + (sigma * fit.noise) ** 2 * np.eye(2 * POINTS)
+        expected = -0.5 * (uv.ravel() @ np.linalg.solve(V, uv.ravel()) + np.linalg.slogdet(V)[1])
+        off.append(log_likelihood(fit, image) - expected)
+    np.testing.assert_allclose(off, off[0], atol=1e-9)
