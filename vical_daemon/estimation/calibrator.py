@@ -223,7 +223,7 @@ class Calibrator:
         """Take the images of a start; return those that readings do not cover yet."""
         assert self._buffer is not None
         for k, (t_cam_s, frame) in enumerate(frames):
-            if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.newest_s:
+            if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.settled_s:
                 return frames[k:]
             report = self._step(f, frame, t_cam_s)
             if report is None:
@@ -232,9 +232,7 @@ class Calibrator:
             if f.unobservable is not None:
                 self._initializer.take([(t_cam_s, frame)])
                 f.unobservable.turned(f)
-            now = f.plain()
-            self._ask_held_back(now, report, frame, t_cam_s)
-            self._note(now, report, frame, t_cam_s)
+            self._note(f.plain(), report, frame, t_cam_s)
             self._reports.append(report)
         return []
 
@@ -243,7 +241,8 @@ class Calibrator:
         reports, self._reports = self._reports, []
         while self.filter is not None and self._buffer is not None:
             shifts = {name: c.timeshift_s for name, c in self.filter.state.cameras.items()}
-            item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
+            covered_s = self._buffer.newest_s if flush else self._buffer.settled_s
+            item = self._pending.pop(shifts, covered_s, flush=flush)
             if item is None:
                 break
             if self._late.take(self.filter, *item):

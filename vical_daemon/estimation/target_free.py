@@ -193,7 +193,7 @@ class TargetFreeCalibrator:
     def _ready(self, window: Window) -> Ready:
         """Images that inertial data cover, at most a step's worth, up to the first gap."""
         assert self._buffer is not None
-        end_s = self._buffer.newest_s - window.shift_s - _LATE_S
+        end_s = self._buffer.settled_s - window.shift_s - _LATE_S
         found = ready(self._pending, window.frames[-1][0], end_s)
         if found.hole_s:
             self._lost(Cause.NO_IMAGES, float(found.hole_s), keep=True)
@@ -213,7 +213,7 @@ class TargetFreeCalibrator:
     def _try_start(self, flush: bool) -> bool:
         """Attempt to start from what waits; True when there is a window now."""
         assert self._buffer is not None
-        end = self._buffer.newest_s - _LATE_S
+        end = self._buffer.settled_s - _LATE_S
         known = self.latest
         self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
         hint = None if self._anew else known

@@ -88,8 +88,8 @@ class CalibrationFilter:
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
-        arm_score: Bias of lever arms by noise of the gyro; None: no image yet, or the motion was lost.
-        arm_scores: What it has given so far, 1/m, shape (3 cameras,); 0: nothing yet.
+        arm_score: Bias of lever arms and the target's size by noise; None: no image yet, or the motion was lost.
+        arm_scores: What it has given so far, 1/m and 1, shape (3 cameras + 1,); 0: nothing yet.
         by_clipping: See `Influence`, of the latest segment.
         jumps: Asked for while something has changed, and nobody knows what.
     """
@@ -138,8 +138,7 @@ class CalibrationFilter:
 
     def _predict_score(self, moved: Propagated, Q: FloatArray) -> None:
         if self.arm_score is not None:
-            noise = self.imu_noise
-            walk = np.repeat([noise.gyro_walk**2, noise.accel_walk**2], 3) * moved.seconds
+            walk = np.repeat([self.imu_noise.gyro_walk**2, self.imu_noise.accel_walk**2], 3) * moved.seconds
             self.arm_score.predict(moved.slopes, Q, walk)
 
     def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
@@ -286,9 +285,8 @@ class CalibrationFilter:
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
         if keep.sum() < len(keep) // 2:
             return 36.0
-        normal = normalised(
-            lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
-        )
+        shown = lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves
+        normal = normalised(*shown, image.sigma_px[keep])
         return None if normal is None else float(normal @ normal) / len(normal)
 
     def _linearise(self, image: Image) -> Linear:
@@ -319,7 +317,7 @@ class CalibrationFilter:
         self.state = retract(self.state, self.layout, dx)
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
-        """What this image adds wrongly to the information vector at the lever arms, shape (3 cameras,)."""
+        """What this image adds wrongly to the information vector at lever arms and size, see `LeverArmScore`."""
         if self.arm_score is None:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
@@ -349,11 +347,13 @@ class CalibrationFilter:
         return replace(self, S=np.concatenate([left[:, None], self.S], axis=1))
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
-        """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""
+        """Step of the state by a score of all lever arms and the target's size, with the covariance S S'."""
         information = np.zeros(self.layout.size)
         for k, where in enumerate(self.layout.cameras.values()):
             if where.position is not None:
                 information[where.position] = score[3 * k : 3 * k + 3]
+        if self.layout.target_scale is not None:
+            information[self.layout.target_scale] = score[-1] / self.state.target_scale
         return np.asarray(S @ (S.T @ information))
 
     def finite(self) -> bool:

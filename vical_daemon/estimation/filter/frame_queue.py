@@ -42,7 +42,7 @@ class FrameQueue:
 
         Args:
             shifts_s: Present time shift of each camera.
-            newest_imu_s: Time of the newest inertial reading.
+            newest_imu_s: Time up to which inertial readings are complete.
             flush: No more data will come: do not wait for the other cameras.
         """
         heads = {name: q[0][0] + shifts_s[name] for name, q in self._queues.items() if q}

@@ -166,6 +166,15 @@ class LinearisedFilter(CalibrationFilter):
         """Corners have been compared with the reference; errors over a hole in the images are no news."""
         return False
 
+    def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
+        """See `CalibrationFilter._arm_score`; about an adjusted motion the target's size has no bias.
+
+        The motion fits images and readings alike (total least squares).
+        """
+        score = CalibrationFilter._arm_score(self, image, lin, fit)
+        score[-1] = 0.0
+        return score
+
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the mean; the reference stays."""
         self.S, self.offset = S, self.offset + dx

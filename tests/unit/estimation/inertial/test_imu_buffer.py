@@ -51,6 +51,37 @@ def test_a_quick_shake_is_not_shortened_by_straight_lines_between_samples():
     assert abs(plain.dv[0, -1, 0] / exact - 1.0) > 1.5e-3
 
 
+def test_a_slow_imu_follows_a_quick_shake():
+    """5 Hz at 50 readings a second; differences over one reading on either side miss four times as much."""
+    w, dt, off = 2 * np.pi * 5.0, 0.02, []
+    buffer = ImuBuffer(0)
+    for k in range(60):
+        buffer.append(k * dt, np.zeros(3), np.array([np.sin(w * k * dt), 0.0, 0.0]))
+    for begin in np.arange(0.2, 0.4, 0.0037):
+        gained = strapdown(buffer.segment(begin, begin + 0.1), np.zeros((1, 3)), np.zeros((1, 3))).dv[
+            0, -1, 0
+        ]
+        off.append(w * gained - (np.cos(w * begin) - np.cos(w * (begin + 0.1))))
+    assert np.sqrt(np.mean(np.square(off))) < 1e-3
+
+
+def test_what_is_settled_is_not_changed_by_later_readings():
+    """An image taken as soon as readings cover it was integrated with a one-sided slope at its end."""
+    buffer = ImuBuffer(0)
+    assert buffer.settled_s == -np.inf
+    for k in range(40):
+        t = 0.02 * k
+        buffer.append(t, rates(t), forces(t))
+        seen_s = buffer.settled_s
+        if k < 30:
+            continue
+        before = buffer.segment(seen_s - 0.033, seen_s)
+        later = ImuBuffer(0)
+        for row in (*buffer.rows, [t + 0.02, *rates(t + 0.02), *forces(t + 0.02)]):
+            later.append(row[0], row[1:4], row[4:])
+        np.testing.assert_array_equal(later.segment(seen_s - 0.033, seen_s).accel_slope, before.accel_slope)
+
+
 def test_a_hole_in_the_data_is_bridged_by_straight_lines():
     buffer = ImuBuffer(0)
     for t in (0.0, 0.01, 0.02, 0.2, 0.21, 0.22):

@@ -10,8 +10,8 @@ from vical_daemon.estimation.wording import event_text
 
 
 def events_with(density_factor):
-    """Calibrate half a minute with densities that are wrong by a factor; the events and the last answer."""
-    run = simulate(2, 36.0, timeshift_cam_imu_s=0.01)
+    """Calibrate 40 s with densities that are wrong by a factor; the events and the last answer."""
+    run = simulate(2, 40.0, timeshift_cam_imu_s=0.01)
     lens, true, k = run.rig.lens, run.rig.densities, density_factor
     noise = ImuNoise(k * true.gyro, true.gyro_walk, k * true.accel, true.accel_walk)
     prior = CameraPrior(lens.resolution, tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
