@@ -88,7 +88,7 @@ class CalibrationFilter:
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
-        arm_score: Bias of lever arms and the target's size by noise; None: no image yet, or the motion was lost.
+        arm_score: Bias of lever arms and size by noise; None: no image yet, or the motion was lost.
         arm_scores: What it has given so far, 1/m and 1, shape (3 cameras + 1,); 0: nothing yet.
         by_clipping: See `Influence`, of the latest segment.
         jumps: Asked for while something has changed, and nobody knows what.
@@ -317,7 +317,7 @@ class CalibrationFilter:
         self.state = retract(self.state, self.layout, dx)
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
-        """What this image adds wrongly to the information vector at lever arms and size, see `LeverArmScore`."""
+        """What this image adds wrongly to the information vector, see `LeverArmScore.update`."""
         if self.arm_score is None:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))

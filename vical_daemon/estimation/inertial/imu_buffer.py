@@ -1,7 +1,7 @@
 """Inertial readings of the recent past: a bounded buffer that cuts a stretch exactly where asked.
 
-Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
-differences): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz. [docs/math/filter.md]
+Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by
+differences over four readings): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz. [docs/math/filter.md]
 """
 
 from __future__ import annotations
@@ -301,8 +301,8 @@ def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
     """Derivatives of the readings at `count` rows from `begin` on, shape (count, 6).
 
     By central differences over one and two readings on either side, extrapolated (Richardson): their error is
-    h^4 w^4 / 30 instead of h^2 w^2 / 6. Next to a hole (four times the usual step and more) the difference over the hole says nothing about the
-    slope: the chord of the other side is taken, or none.
+    h^4 w^4 / 30 instead of h^2 w^2 / 6. Next to a hole (four times the usual step and more) the difference
+    over the hole says nothing about the slope: the chord of the other side is taken, or none.
     """
     t, values = rows[:, 0], rows[:, 1:]
     dt = t[1:] - t[:-1]

@@ -58,9 +58,7 @@ def test_a_slow_imu_follows_a_quick_shake():
     for k in range(60):
         buffer.append(k * dt, np.zeros(3), np.array([np.sin(w * k * dt), 0.0, 0.0]))
     for begin in np.arange(0.2, 0.4, 0.0037):
-        gained = strapdown(buffer.segment(begin, begin + 0.1), np.zeros((1, 3)), np.zeros((1, 3))).dv[
-            0, -1, 0
-        ]
+        gained = strapdown(buffer.segment(begin, begin + 0.1), *np.zeros((2, 1, 3))).dv[0, -1, 0]
         off.append(w * gained - (np.cos(w * begin) - np.cos(w * (begin + 0.1))))
     assert np.sqrt(np.mean(np.square(off))) < 1e-3
 
