@@ -1,7 +1,8 @@
 """Inertial readings of the recent past: a bounded buffer that cuts a stretch exactly where asked.
 
-Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by
-differences over four readings): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz. [docs/math/filter.md]
+Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
+differences of fourth order): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz.
+[docs/math/filter.md]
 """
 
 from __future__ import annotations

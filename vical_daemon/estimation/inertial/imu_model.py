@@ -1,7 +1,7 @@
 """Strapdown integration of inertial readings for a batch of biases, its derivatives and its noise.
 
-Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by
-differences over four readings), with the coning term for the attitude; velocity and position are integrated exactly for a
+Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
+differences), with the coning term for the attitude; velocity and position are integrated exactly for a
 specific force that is cubic in the *start* frame. Averaging two samples as if both lay in one frame would
 bias the time shift by tenths of a millisecond; straight lines between samples would shorten a 3 Hz shake by
 0.3 % at 100 Hz, which ends up in the lever arm, always in the same direction (see docs/math/filter.md).
