@@ -12,8 +12,8 @@ from vical_mocks.points import board_points
 from vical_mocks.rig import reference_rig
 from vical_mocks.trajectory import Trajectory, constant_rate, hand_motion, one_axis, pure_translation
 
+from benchmarks.observability_model import ModelBlocks, model_rank
 from vical_daemon.estimation.tools.observability import Motion, Setup, covariance_of, gramian
-from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
 
 FloatArray = npt.NDArray[np.float64]
 

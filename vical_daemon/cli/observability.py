@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from vical_daemon.estimation.guidance import WeakDirection
     from vical_daemon.estimation.measurements import FloatArray
     from vical_daemon.estimation.tools.observability import Motion, Observability, Setup
-    from vical_daemon.estimation.tools.observability_model import ModelRank
 
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
@@ -46,7 +46,6 @@ def run(args: argparse.Namespace) -> int:
         raise CliError(f"{args.input} does not exist; check the path")
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.estimation.tools.observability import gramian
-    from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
     from vical_daemon.offline.observability_motion import motion_of
 
     motion, setup, frames = motion_of(
@@ -59,18 +58,8 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     result = gramian(motion, setup, frames)
-    model = model_rank(
-        ModelBlocks(
-            intrinsics="intrinsics" in blocks,
-            imu_matrix="imu_matrix" in blocks,
-            target_scale="target_scale" in blocks,
-            readout="readout" in blocks,
-            target_free=setup.seen is not None,
-            gravity="free" if setup.seen is None else "magnitude",
-        )
-    )
     missing = _missing(result, motion, setup)
-    document = _document(result, motion, missing, model, len(frames))
+    document = _document(result, motion, missing, _allowed(result, blocks), len(frames))
     if args.json:
         print(json.dumps(document))
     else:
@@ -117,8 +106,17 @@ def sigmas(result: Observability) -> FloatArray:
     return np.where(sigma > _LOST_SHARE * _PRIOR * result.units, np.inf, sigma)
 
 
+def _allowed(result: Observability, blocks: Sequence[str]) -> int:
+    """How many of the unknowns any motion can determine: the rank of the model's Lie derivatives.
+
+    All of them, but for one where the scale of the accelerometer and the size of the board may both be off.
+    [docs/math/observability.md; `tests/unit/benchmarks/test_observability_model.py`]
+    """
+    return result.unknowns - ({"imu_matrix", "target_scale"} <= set(blocks))
+
+
 def _document(
-    result: Observability, motion: Motion, missing: list[WeakDirection], model: ModelRank, frames: int
+    result: Observability, motion: Motion, missing: list[WeakDirection], allowed: int, frames: int
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -154,18 +152,8 @@ def _document(
         "rate_rms_rps": rates.tolist(),
         "seconds": float(motion.t_s[-1] - motion.t_s[0]),
         "frames": frames,
-        "model": _of_calibration(model),
+        "model": {"rank": allowed, "unknowns": result.unknowns},
     }
-
-
-def _of_calibration(model: ModelRank) -> dict[str, int]:
-    """Rank and unknowns of a model, of its calibration and motion.
-
-    Without a target the points do not count, nor place and orientation of the world, which are a choice.
-    """
-    points = sum(name == "landmark" for name in model.names)
-    chosen = 6 if points else 0
-    return {"rank": model.rank - points, "unknowns": model.unknowns - points - chosen}
 
 
 def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
+from benchmarks.power_series import ComplexArray, div, exp, matmul, mul, shift, trajectory
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.tools.power_series import ComplexArray, div, exp, matmul, mul, shift, trajectory
 
 _STEP = 1e-30
 _ORDER = 12
