@@ -36,7 +36,6 @@ from vical_daemon.estimation.model.imu_scale import numbers_of
 from vical_daemon.estimation.model.inertial_links import (
     DONE,
     RELINK_S,
-    PreintegratedLink,
     PreintegratedLinks,
     make_links,
 )
@@ -141,13 +140,13 @@ class BoardWindow:
         self,
         state: State,
         nodes: list[Node],
-        links: list[PreintegratedLink],
+        links: PreintegratedLinks,
         prior: CalibrationFilter,
         buffer: ImuBuffer,
         target: FloatArray,
     ) -> None:
         self.state, self.nodes, self._buffer, self._target = state, nodes, buffer, target
-        self._links = PreintegratedLinks.stack(links)
+        self._links = links
         self.layout, self._noise, self._S = prior.layout, prior.imu_noise, prior.S
         root = np.linalg.inv(prior.S[MOTION.stop :, MOTION.stop :])
         self._information = root.T @ root
@@ -176,11 +175,10 @@ class BoardWindow:
         if links is None:
             return None
         g = state.gravity
-        for (a, b), link in zip(pairwise(nodes), links, strict=True):
-            T = link.dt_s
-            a.at = a.at._replace(v=(b.at.p - a.at.p - a.at.R @ link.dp) / T - 0.5 * T * g)
-        last, link = nodes[-2].at, links[-1]
-        nodes[-1].at = nodes[-1].at._replace(v=last.v + link.dt_s * g + last.R @ link.dv)
+        for (a, b), T, dp in zip(pairwise(nodes), links.dt, links.dp, strict=True):
+            a.at = a.at._replace(v=(b.at.p - a.at.p - a.at.R @ dp) / T - 0.5 * T * g)
+        last = nodes[-2].at
+        nodes[-1].at = nodes[-1].at._replace(v=last.v + links.dt[-1] * g + last.R @ links.dv[-1])
         out = cls(replace(state), nodes, links, prior, buffer, target)
         out._read()
         out._find_rates()
@@ -283,7 +281,7 @@ class BoardWindow:
         links = _integrated(self.nodes, self.state, self._noise, self._buffer)
         if links is None:
             return False
-        self._links = PreintegratedLinks.stack(links)
+        self._links = links
         self._read()
         self._find_rates()
         return True
@@ -471,7 +469,7 @@ def _numbers(s: State) -> FloatArray:
 
 def _integrated(
     nodes: list[Node], state: State, noise: ImuNoise, buffer: ImuBuffer
-) -> list[PreintegratedLink] | None:
+) -> PreintegratedLinks | None:
     """Links between the instants; None where these are not in order or readings do not reach."""
     t_s = np.array([n.at.t_s for n in nodes])
     if (np.diff(t_s) < 0.5 * _TOGETHER_S).any():

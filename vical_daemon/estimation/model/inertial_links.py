@@ -6,7 +6,6 @@ Preintegration after Forster et al., "On-manifold preintegration for real-time v
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,36 +23,14 @@ ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be giv
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
-@dataclass(slots=True)
-class PreintegratedLink:
-    """Motion from one image to the next, in the imu frame of the first.
-
-    Attributes:
-        dt_s: Length, s.
-        dR, dv, dp: Relative rotation, and integrals of the specific force without gravity.
-        by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by the
-            sixteen numbers of `imu_scale` where they are estimated, shape (9, 6) or (9, 22).
-        root_information: W with W^T W = inverse covariance of [rotation, velocity, position], (9, 9).
-        imu: Biases (and numbers) for which it was integrated, shape (6,) or (22,).
-    """
-
-    dt_s: float
-    dR: FloatArray
-    dv: FloatArray
-    dp: FloatArray
-    by_imu: FloatArray
-    root_information: FloatArray
-    imu: FloatArray
-
-
 def make_links(
     buffer: ImuBuffer, t_s: FloatArray, imu: FloatArray, noise: ImuNoise
-) -> list[PreintegratedLink] | None:
+) -> PreintegratedLinks | None:
     """Integrate between consecutive instants of the imu's clock.
 
     Args:
         buffer: Readings.
-        t_s: Instants in order, s, shape (m + 1,).
+        t_s: Instants in order, at least two, s, shape (m + 1,).
         imu: Of each link [gyro, accel] bias, rad/s and m/s^2; with the numbers of `imu_scale` where they are
             estimated; shape (m, 6) or (m, 22).
         noise: Densities.
@@ -61,8 +38,6 @@ def make_links(
     Returns:
         The links; None where readings are missing for one, or none that a device could give.
     """
-    if len(t_s) < 2:
-        return []
     found = buffer.intervals(t_s)
     if found is None or found[0].gap_s > _MAX_HOLE_S:
         return None
@@ -95,12 +70,22 @@ def make_links(
             np.column_stack([by_entries(e, as_read[own], g, a), e.by_force(force_slope[own])])
             for e, own, g, a in zip(motion.influences, motion.nodes, M_g, M_a, strict=True)
         ]
-    columns = (motion.dt.tolist(), motion.dR, motion.dv, motion.dp, np.array(by_imu)[:, _ORDER], root)
-    return [PreintegratedLink(*x) for x in zip(*columns, imu.copy(), strict=True)]
+    return PreintegratedLinks(
+        motion.dt, motion.dR, motion.dv, motion.dp, np.array(by_imu)[:, _ORDER], root, imu.copy()
+    )
 
 
 class PreintegratedLinks(NamedTuple):
-    """Links of a window stacked, for batched arithmetic (m of them)."""
+    """Motion from one image to the next, m times, each in the imu frame of the first of both.
+
+    Attributes:
+        dt: Lengths, s, shape (m,).
+        dR, dv, dp: Relative rotations (m, 3, 3), and integrals of the specific force without gravity (m, 3).
+        by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by the
+            sixteen numbers of `imu_scale` where they are estimated, shape (m, 9, 6) or (m, 9, 22).
+        root: W with W^T W = inverse covariance of [rotation, velocity, position], shape (m, 9, 9).
+        imu: Biases (and numbers) for which they were integrated, shape (m, 6) or (m, 22).
+    """
 
     dt: FloatArray
     dR: FloatArray
@@ -108,20 +93,17 @@ class PreintegratedLinks(NamedTuple):
     dp: FloatArray
     by_imu: FloatArray
     root: FloatArray
-    imu: FloatArray  # (m, 6) or (m, 22)
+    imu: FloatArray
 
     @classmethod
-    def stack(cls, links: list[PreintegratedLink]) -> PreintegratedLinks:
-        """Put links side by side."""
-        return cls(
-            np.array([x.dt_s for x in links]),
-            np.array([x.dR for x in links]),
-            np.array([x.dv for x in links]),
-            np.array([x.dp for x in links]),
-            np.array([x.by_imu for x in links]),
-            np.array([x.root_information for x in links]),
-            np.array([x.imu for x in links]),
-        )
+    def none(cls, numbers: int) -> PreintegratedLinks:
+        """No links, of so many `imu` each."""
+        shapes = ((), (3, 3), (3,), (3,), (9, numbers), (9, 9), (numbers,))
+        return cls(*(np.zeros((0, *shape)) for shape in shapes))
+
+    def plus(self, more: PreintegratedLinks) -> PreintegratedLinks:
+        """These, and then more."""
+        return PreintegratedLinks(*(np.concatenate(pair) for pair in zip(self, more, strict=True)))
 
     def errors(
         self, R: FloatArray, p: FloatArray, v: FloatArray, imu: FloatArray, gravity: FloatArray

@@ -17,7 +17,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import DONE, PreintegratedLinks
+from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
@@ -89,14 +89,12 @@ class _Present:
 
     Attributes:
         view: Of the observations.
-        links: Between the images.
         normal: Normal equations.
         damping: Of the next step.
         cleaned: Observations that do not fit have been taken out.
     """
 
     view: View
-    links: PreintegratedLinks
     normal: Normal
     damping: float = _DAMPING
     cleaned: bool = False
@@ -161,14 +159,14 @@ class Bundle:
         seen = self.window.observe()
         if len(seen.begin) < _LEAST_LANDMARKS:
             return None
-        links, view = self.window.stacked(), self.problem.view(seen)
-        return _Present(view, links, self.problem.normal(view, links))
+        view = self.problem.view(seen)
+        return _Present(view, self.problem.normal(view))
 
     def _tried(self, now: _Present, step: _Step) -> bool:
         """Take a step if it lowers the sum of squares; else damp the next one."""
         saved = self._save()
         there = self._applied(step, now.view.seen)
-        trial = self.problem.normal(there, now.links)
+        trial = self.problem.normal(there)
         if np.isfinite(trial.cost) and trial.cost <= now.normal.cost:
             now.view, now.normal = there, trial
             now.relax()
@@ -184,8 +182,8 @@ class Bundle:
         if self.window.stale():
             if not self.window.relink(buffer):
                 return None
-            now.links, now.view = self.window.stacked(), self.problem.view(now.view.seen)
-        now.normal = self.problem.normal(now.view, now.links)
+            now.view = self.problem.view(now.view.seen)
+        now.normal = self.problem.normal(now.view)
         return now
 
     def _save(self) -> _Saved:
@@ -288,7 +286,7 @@ class Bundle:
         problem = self.problem
         if problem.noise.jitter_s:
             return False
-        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(now.view, now.links))
+        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(now.view))
         return problem.noise.jitter_s > 0.0
 
     def _jitters_more(self, fit: Fit) -> bool:
@@ -341,9 +339,7 @@ class Bundle:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
-        inertial, jitter_s, alike = links_left(
-            w, now.links, self.problem.noise.jitter_s, order, np.tril(root)
-        )
+        inertial, jitter_s, alike = links_left(w, self.problem.noise.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])

@@ -13,6 +13,7 @@ from vical_daemon.estimation.measurements import (
     ImuNoise,
     PointsFrame,
 )
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     GYRO_BIAS_SIGMA_RPS,
@@ -125,7 +126,7 @@ def next_window(window: Window, carry: MarginalPrior) -> Window:
         np.zeros((1, 3)),
         (carry.R @ carry.speed)[None],
         carry.bias[None].copy(),
-        [],
+        PreintegratedLinks.none(6 + len(window.imu)),
         carry.camera.timeshift_s,
         empty,
         gravity=window.gravity,

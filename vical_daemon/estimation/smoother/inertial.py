@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.stamp_jitter import FLOOR_S
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
@@ -47,20 +46,17 @@ class Order:
         return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
 
 
-def link_errors(window: Window, links: PreintegratedLinks) -> tuple[FloatArray, FloatArray]:
+def link_errors(window: Window) -> tuple[FloatArray, FloatArray]:
     """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 40)."""
     w = window
-    return links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
+    return w.links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
 
 
-def add_links(
-    window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, H: FloatArray, g: FloatArray
-) -> float:
+def add_links(window: Window, jitter_s: float, order: Order, H: FloatArray, g: FloatArray) -> float:
     """Add the links and the walk of the biases to the normal equations, in place.
 
     Args:
         window: Present values.
-        links: Of the window.
         jitter_s: Standard deviation of the images' stamps, s; 0: exact.
         order: Places of the unknowns.
         H: Normal matrix, shape (n, n).
@@ -70,7 +66,7 @@ def add_links(
         Their sum of squares.
     """
     knots = window.knots()
-    e, J = link_errors(window, links)
+    e, J = link_errors(window)
     JT = np.swapaxes(J, 1, 2)
     A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
     # neighbours share an image and many links a knot: even and odd links, then the knots one by one
@@ -125,19 +121,16 @@ def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> flo
     return cost
 
 
-def links_left(
-    window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, root: FloatArray
-) -> tuple[float, float, float]:
+def links_left(window: Window, jitter_s: float, order: Order, root: FloatArray) -> tuple[float, float, float]:
     """Mean squared error of the links, the jitter of the stamps that they show, s, and how alike it is.
 
     Args:
         window: Adjusted.
-        links: Of the window.
         jitter_s: Jitter that was allowed for.
         order: Places of the unknowns.
         root: Lower Cholesky factor of the normal matrix.
     """
-    e, J = link_errors(window, links)
+    e, J = link_errors(window)
     if not jitter_s:
         return float((e**2).mean()), 0.0, 0.0
     late = StampOffsets(window, e, J, jitter_s)

@@ -12,7 +12,6 @@ from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.robust import huber_weight
@@ -165,7 +164,7 @@ class Problem:
         size = np.sqrt((e**2).sum(axis=1))
         return e, np.where(view.valid, huber_weight(size, HUBER), 0.0)
 
-    def normal(self, view: View, links: PreintegratedLinks) -> Normal:
+    def normal(self, view: View) -> Normal:
         """Normal equations with landmarks kept apart."""
         e, weight = self.pixel_errors(view)
         e *= np.sqrt(weight)[:, None]
@@ -173,7 +172,7 @@ class Problem:
         cost = self._robust_cost(e, weight) / spread**2
         J = self._derivatives(view, np.sqrt(weight) / (self.noise.sigma_px * spread))
         J[:, :, -1] = e / spread
-        return self._assemble(view.seen, links, J, cost)
+        return self._assemble(view.seen, J, cost)
 
     def _derivatives(self, view: View, whitening: FloatArray) -> FloatArray:
         """How pixels move, times a factor each (N,), and a last column for errors, (N, 2, 9 + c + 1).
@@ -256,7 +255,7 @@ class Problem:
         outer = 2.0 * HUBER * np.sqrt(square / np.maximum(weight, 1e-12)) - HUBER**2
         return float(np.where(weight < 1.0, outer, inner).sum()) + 1e4 * float((weight == 0.0).sum())
 
-    def _assemble(self, seen: Seen, links: PreintegratedLinks, J: FloatArray, cost: float) -> Normal:
+    def _assemble(self, seen: Seen, J: FloatArray, cost: float) -> Normal:
         """The normal equations from derivatives and errors of the pixels (`_derivatives`) and their cost."""
         w, order = self.window, self.order()
         F, L = len(w.frames), len(seen.begin)
@@ -285,7 +284,7 @@ class Problem:
         W[:, :, 6 * F :] = own[:, :, columns]
         by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
         by_frame[seen.landmark, :, seen.frame] = np.swapaxes(J[:, :, :3], 1, 2) @ J[:, :, 3:9]
-        cost += add_links(w, links, self.noise.jitter_s, order, H, g)
+        cost += add_links(w, self.noise.jitter_s, order, H, g)
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
@@ -298,12 +297,12 @@ class Problem:
         lens = _CONSTANTS + layout.camera.intrinsics.start - layout.dynamic + np.arange(self.own)
         return np.concatenate([constants, lens])
 
-    def suspected_jitter_s(self, view: View, links: PreintegratedLinks) -> float:
+    def suspected_jitter_s(self, view: View) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
         """
-        by_links = first_guess(self.window, *link_errors(self.window, links))
+        by_links = first_guess(self.window, *link_errors(self.window))
         late, variance = self.pixels_late(view)
         return float(np.hypot(by_links, excess(late**2, variance)))
 

@@ -45,7 +45,7 @@ class _Found(NamedTuple):
     """What rotations say, or what was known before."""
 
     camera: CameraState
-    imu: FloatArray  # biases, and numbers of `imu_scale`, see `PreintegratedLink`
+    imu: FloatArray  # biases, and numbers of `imu_scale`, see `PreintegratedLinks`
     arm_sigma_m: float
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 

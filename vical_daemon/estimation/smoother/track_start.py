@@ -19,7 +19,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
 from vical_daemon.estimation.measurements import FloatArray, Frames, ImuNoise
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
+from vical_daemon.estimation.model.inertial_links import make_links
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
@@ -69,7 +69,7 @@ class TrackStart:
         buffer: Inertial readings.
         frames: (stamp in the camera's clock in s, tracks), in order.
         camera: Time shift and lens must be roughly right.
-        imu: Biases, and numbers of `imu_scale` where they are estimated, see `PreintegratedLink`, shape (6,)
+        imu: Biases, and numbers of `imu_scale` where they are estimated, see `PreintegratedLinks`, shape (6,)
             or (22,).
         noise: Densities.
         gravity_mps2: Magnitude of gravity.
@@ -93,9 +93,8 @@ class TrackStart:
         if links is None:
             raise NoStartError("inertial data do not cover the images")
         self.camera, self._gravity_mps2 = camera, gravity_mps2
-        stacked = PreintegratedLinks.stack(links)
-        self._R = products(stacked.dR[None])[0]
-        self._motion = LinearMotion.along(self._R, stacked.dt, stacked.dR, stacked.dv, stacked.dp)
+        self._R = products(links.dR[None])[0]
+        self._motion = LinearMotion.along(self._R, links.dt, links.dR, links.dv, links.dp)
         none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         zero = np.zeros((len(frames), 3))
         window = Window(
@@ -146,10 +145,9 @@ class TrackStart:
         window.p = (self._motion.D + self._motion.A @ at) @ world.T
         window.R = world @ self._R
         # the velocity by differences of positions would be coarse: it is carried along the links
-        v = [z[SPEED]]
-        for k, link in enumerate(window.links):
-            v.append(v[-1] + link.dt_s * gravity + self._R[k] @ link.dv)
-        window.v = np.array(v) @ world.T
+        links = window.links
+        gained = links.dt[:, None] * gravity + np.matmul(self._R[:-1], links.dv[..., None])[..., 0]
+        window.v = np.cumsum(np.concatenate([z[None, SPEED], gained]), axis=0) @ world.T
         self.camera.p_imu_cam = z[ARM].copy()
         window.bias[:, 3:] = z[BIAS]
         window.gravity = np.array([0.0, 0.0, -self._gravity_mps2])

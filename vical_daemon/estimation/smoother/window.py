@@ -20,7 +20,6 @@ from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import (
     RELINK_S,
-    PreintegratedLink,
     PreintegratedLinks,
     make_links,
 )
@@ -106,7 +105,7 @@ class Window:
     p: FloatArray
     v: FloatArray
     bias: FloatArray
-    links: list[PreintegratedLink]
+    links: PreintegratedLinks
     shift_s: float
     landmarks: Landmarks
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
@@ -167,17 +166,21 @@ class Window:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
         imu = np.concatenate([self.bias[-1], self.imu])[None]
         t_s = np.array([self.frames[-1][0], *(t for t, _ in frames)]) + self.shift_s
-        for count in range(len(frames), -1, -1):  # all but those that readings do not reach
+        count, links = len(frames), None
+        while count:  # all but those that readings do not reach
             links = make_links(buffer, t_s[: count + 1], np.repeat(imu, count, axis=0), self.noise)
             if links is not None:
                 break
+            count -= 1
+        if links is None:
+            return 0
         R, p, v = [self.R], [self.p], [self.v]
         at = (self.R[-1], self.p[-1], self.v[-1])
-        for link in links or ():
-            at = carried(link, *at, self.gravity)
+        for k in range(count):
+            at = carried(links, k, *at, self.gravity)
             for store, value in zip((R, p, v), at, strict=True):
                 store.append(value[None])
-        self.links += links or []
+        self.links = self.links.plus(links)
         self.frames += frames[:count]
         self.R, self.p, self.v = np.concatenate(R), np.concatenate(p), np.concatenate(v)
         self.fit_knots()
@@ -218,17 +221,13 @@ class Window:
 
     def stale(self) -> bool:
         """Whether the links hold for another time shift or other biases than are believed now."""
-        off = np.abs(self.imu_by_link() - np.array([x.imu for x in self.links]))
+        off = np.abs(self.imu_by_link() - self.links.imu)
         return (
             abs(self.camera.timeshift_s - self.shift_s) > RELINK_S
             or float(off[:, :3].max()) > 5e-3
             or float(off[:, 3:6].max()) > 0.5
             or float(off[:, 6:].max(initial=0.0)) > 5e-3
         )
-
-    def stacked(self) -> PreintegratedLinks:
-        """The links for batched arithmetic."""
-        return PreintegratedLinks.stack(self.links)
 
     # ------------------------------------------------------------------ landmarks
     def observe(self) -> Seen:
@@ -283,11 +282,11 @@ def _listed(frame: IntArray, landmark: IntArray, uv: FloatArray, camera: CameraS
 
 
 def carried(
-    link: PreintegratedLink, R: FloatArray, p: FloatArray, v: FloatArray, gravity: FloatArray
+    links: PreintegratedLinks, k: int, R: FloatArray, p: FloatArray, v: FloatArray, gravity: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Motion at the end of a link."""
-    T = link.dt_s
-    return R @ link.dR, p + T * v + 0.5 * T * T * gravity + R @ link.dp, v + T * gravity + R @ link.dv
+    """Motion at the end of link k."""
+    T, dR, dv, dp = links.dt[k], links.dR[k], links.dv[k], links.dp[k]
+    return R @ dR, p + T * v + 0.5 * T * T * gravity + R @ dp, v + T * gravity + R @ dv
 
 
 def rays_of(uv: FloatArray, camera: CameraState) -> tuple[FloatArray, BoolArray]:

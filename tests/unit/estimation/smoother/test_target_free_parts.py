@@ -15,7 +15,7 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
+from vical_daemon.estimation.model.inertial_links import make_links
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
@@ -77,8 +77,7 @@ class Scene:
 
 
 def _link(buffer, from_s, to_s, imu, noise):
-    links = make_links(buffer, np.array([from_s, to_s]), imu[None], noise)
-    return None if links is None else links[0]
+    return make_links(buffer, np.array([from_s, to_s]), imu[None], noise)
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +88,7 @@ def scene():
 @pytest.mark.parametrize("numbers", [6, 22])
 def test_links_derivatives_agree_with_differences(scene, numbers):
     zero = np.zeros(numbers)
-    links = PreintegratedLinks.stack(
-        make_links(scene.buffer, np.linspace(0.3, 0.45, 4), np.tile(zero, (3, 1)), scene.noise)
-    )
+    links = make_links(scene.buffer, np.linspace(0.3, 0.45, 4), np.tile(zero, (3, 1)), scene.noise)
     rng = np.random.default_rng(1)
     R = Rotation.from_rotvec(0.4 * rng.standard_normal((4, 3))).as_matrix()
     p, v = rng.standard_normal((2, 4, 3))
@@ -122,8 +119,8 @@ def test_link_carries_the_true_motion(scene):
     a, b = 1.0 + offset, 1.5 + offset
     R = move.R_world_imu(a).T @ move.R_world_imu(b)
     dv = move.R_world_imu(a).T @ (move.v_world_imu(b) - move.v_world_imu(a) - 0.5 * g)
-    e = np.concatenate([Rotation.from_matrix(link.dR.T @ R).as_rotvec(), dv - link.dv])
-    assert np.abs(link.root_information[:6, :6] @ e).max() < 4.5
+    e = np.concatenate([Rotation.from_matrix(link.dR[0].T @ R).as_rotvec(), dv - link.dv[0]])
+    assert np.abs(link.root[0, :6, :6] @ e).max() < 4.5
 
 
 def test_a_link_is_not_made_over_a_hole_in_the_readings():
@@ -210,10 +207,11 @@ def test_links_follow_the_matrices_as_integrating_anew_does(scene):
         step = np.zeros(22)
         step[k] = 1e-4
         up, down = (_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
-        turn = Rotation.from_matrix(down.dR.T @ up.dR).as_rotvec()
-        change = np.concatenate([turn, up.dv - down.dv, up.dp - down.dp]) / 2e-4
-        scale = np.repeat(np.abs(link.by_imu).max(axis=1).reshape(3, 3).max(axis=1), 3)
-        np.testing.assert_allclose(link.by_imu[:, k] / scale, change / scale, atol=6e-3)
+        turn = Rotation.from_matrix(down.dR[0].T @ up.dR[0]).as_rotvec()
+        change = np.concatenate([turn, (up.dv - down.dv)[0], (up.dp - down.dp)[0]]) / 2e-4
+        by_imu = link.by_imu[0]
+        scale = np.repeat(np.abs(by_imu).max(axis=1).reshape(3, 3).max(axis=1), 3)
+        np.testing.assert_allclose(by_imu[:, k] / scale, change / scale, atol=6e-3)
 
 
 @pytest.mark.parametrize(("readout_s", "model"), [(0.0, "radtan"), (0.02, "radtan"), (0.02, "plumb_bob")])
@@ -225,8 +223,8 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
     window.own_lens = 1e-6 * np.ones(4 + coefficients)
     layout = window_layout(model)
     problem = bundle_of(window, layout, 50.0).problem
-    seen, links = window.observe(), window.stacked()
-    normal, order = problem.normal(problem.view(seen), links), problem.order()
+    seen = window.observe()
+    normal, order = problem.normal(problem.view(seen)), problem.order()
     rng = np.random.default_rng(2)
     of_lens = np.array([0.01] * 4 + [1e-5] * coefficients)
     scales = np.array([1e-6] * 15 + [1e-5] + [1e-4] * 6 + [1e-5] * 2 + [*of_lens, 1e-5])
@@ -236,7 +234,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         camera, costs = window.camera, []
         for d in (step, -step):
             window.camera, window.imu = moved_camera(camera, layout.camera, d), d[layout.inertial]
-            costs.append(problem.normal(problem.view(seen), links).cost)
+            costs.append(problem.normal(problem.view(seen)).cost)
         window.camera, window.imu = camera, np.zeros(16)
         up, down = costs
         slope = (up - down) / 2.0 / size / 2.0
@@ -246,14 +244,14 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         step, costs = size * np.eye(len(own))[k], []
         for d in (step, -step):
             window.own_lens = own + d
-            costs.append(problem.normal(problem.view(seen), links).cost)
+            costs.append(problem.normal(problem.view(seen)).cost)
         slope, at = (costs[0] - costs[1]) / 4.0 / size, order.own[k]
         assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
 
 
 def test_late_images_move_the_errors_of_links_as_told(scene):
     window = scene.window()
-    links, knots = window.stacked(), window.knots()
+    links, knots = window.links, window.knots()
     e, J = links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)
     order = Order(len(window.frames), len(window.bias), 0)
     at = np.concatenate([order.frames[:-1], order.frames[1:], order.knots[knots]], axis=1)
@@ -305,7 +303,7 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
 @pytest.mark.parametrize("case", ["step", "jitter"])
 def test_images_that_are_late_alike_are_no_jitter(scene, case):
     window = scene.window()
-    links, knots = window.stacked(), window.knots()
+    links, knots = window.links, window.knots()
     rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
     count = len(window.frames)
     late = 1e-3 * np.random.default_rng(8).standard_normal((count, 1))
