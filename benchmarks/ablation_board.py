@@ -47,8 +47,7 @@ from vical_daemon.estimation.noise.shared_errors import SharedErrors
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status import change_watch
-from vical_daemon.estimation.status.change_watch import ChangeWatch
-from vical_daemon.estimation.status.drift_watch import DriftWatch
+from vical_daemon.estimation.status.change_watch import ChangeWatch, DriftWatch
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.steady_status import SteadyStatus

@@ -19,14 +19,13 @@ from benchmarks.ablation_patches import (
 )
 from vical_daemon.estimation import target_free
 from vical_daemon.estimation.model import start_sigmas
-from vical_daemon.estimation.noise.lens_misfit import LensMisfit
+from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.smoother import (
     alternative_models,
     bundle,
     clock_changes,
     handover,
     normal,
-    quality,
     target_free_status,
 )
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
@@ -209,7 +208,7 @@ FREE: dict[str, Mechanism] = {
     "free: Huber": Mechanism(
         WRONG,
         "large errors weigh less",
-        lambda: [(normal, "HUBER", 1e9), (quality, "HUBER", 1e9)],
+        lambda: [(normal, "HUBER", 1e9), (bundle, "HUBER", 1e9)],
         free=True,
         faults=("free: 3 % outliers",),
     ),

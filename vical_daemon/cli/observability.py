@@ -75,7 +75,7 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDi
     """What is missing, from the bound with next to no prior."""
     import numpy as np
 
-    from vical_daemon.estimation.status.excitation import RunningMotion, missing_motion
+    from vical_daemon.estimation.status.excitation import RunningMotion, weak_directions
     from vical_daemon.estimation.tools.observability import covariance_of
 
     covariance = covariance_of(result)
@@ -85,7 +85,8 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDi
     for t, rate in zip(motion.t_s, motion.rate_rps, strict=True):
         turning.add(float(t), rate)
     part = covariance[np.ix_(index, index)]
-    return missing_motion(part, setup.R_imu_cam, turning.scatter(), turning.rate_change_rps2)
+    sigma_s = float(np.sqrt(part[6, 6]))
+    return weak_directions(part[:6, :6], setup.R_imu_cam, sigma_s, turning)
 
 
 _PRIOR = 1e3  # of `covariance_of`: ten metres, a radian, a second: next to no knowledge

@@ -22,21 +22,27 @@ from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOption
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
-from vical_daemon.estimation.noise.lens_misfit import LensMisfit
+from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.selection.model_selection import IMU, LAG
-from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.bundle import Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, calibration_difference
 from vical_daemon.estimation.smoother.normal import ImageNoise
-from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, with_next_term
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.smoother.thinning import Thinning
-from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
+from vical_daemon.estimation.smoother.waiting_tracks import (
+    SLACK_S,
+    STEP_S,
+    Ready,
+    Stamped,
+    Thinning,
+    cleaned,
+    ready,
+)
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.status.evaluator import PATIENCE_S
 

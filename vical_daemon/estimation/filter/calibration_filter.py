@@ -187,17 +187,12 @@ class CalibrationFilter:
             image = replace(image, sigma_px=blur * image.sigma_px)
             keep = lin.valid & self._belonging(image, innovation, lin)
         if keep.sum() < LEAST_POINTS:
-            return self._refused(image, innovation, predicted, "too few corners pass the gate")
+            return self._refused(image, innovation, predicted)
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
         if self._misses_gate(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
-            return self._refused(
-                image,
-                innovation,
-                predicted,
-                f"innovation of the image is {level:.1f} times what it should be",
-            )
+            return self._refused(image, innovation, predicted)
         self.nis_level += 0.05 * (level - self.nis_level)
         noise_updates.learn(self, image, lin, fit)
         score = self._arm_score(image, lin, fit)
@@ -270,11 +265,10 @@ class CalibrationFilter:
         return Image(name, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, scale)
 
     @staticmethod
-    def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
+    def _refused(image: Image, residual: FloatArray, predicted: FloatArray) -> FrameReport:
         none = np.zeros(len(image.ids), dtype=bool)
         return FrameReport(
             *(image.t_ns, image.camera, image.ids, image.uv, residual, none, False),
-            reason=why,
             predicted_px=predicted,
             log_likelihood=log_likelihood(None, image),
         )

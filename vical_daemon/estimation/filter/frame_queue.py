@@ -18,22 +18,18 @@ class FrameQueue:
     """
 
     def __init__(self, cameras: list[str]) -> None:
-        self._queues: dict[str, deque[tuple[float, PointsFrame]]] = {n: deque() for n in cameras}
-        self.dropped = 0
+        self._queues: dict[str, deque[tuple[float, PointsFrame]]] = {
+            name: deque(maxlen=_MOST) for name in cameras
+        }
 
     def __len__(self) -> int:
         return sum(map(len, self._queues.values()))
 
     def push(self, t_cam_s: float, frame: PointsFrame) -> None:
-        """Append an image; stamps of one camera that go backwards are dropped and counted."""
+        """Append an image; those of one camera whose stamps go backwards are dropped."""
         queue = self._queues[frame.camera]
-        if queue and t_cam_s <= queue[-1][0]:
-            self.dropped += 1
-            return
-        queue.append((t_cam_s, frame))
-        if len(queue) > _MOST:
-            queue.popleft()
-            self.dropped += 1
+        if not queue or t_cam_s > queue[-1][0]:
+            queue.append((t_cam_s, frame))
 
     def pop(
         self, shifts_s: dict[str, float], newest_imu_s: float, *, flush: bool

@@ -61,11 +61,9 @@ class ImageIntake:
     inertial readings that arrive with them. They are moved back to where they usually are.
 
     Attributes:
-        refused: Images left out.
-        repeated: Those of them that were the last one again.
+        repeated: Images left out because they were the last one again.
     """
 
-    refused: int = 0
     repeated: int = 0
     _streams: dict[str, _Stream] = field(default_factory=dict)
     _news: list[Event] = field(default_factory=list)
@@ -88,11 +86,9 @@ class ImageIntake:
         if _same(stream.newest, frame):
             stream.repeats += 1
             self.repeated += 1
-            self.refused += 1
             return None
         t_s = t_cam_s + stream.offset_s
         if not self._in_step(stream, frame.camera, t_s - newest_imu_s, newest_imu_s):
-            self.refused += 1
             return None
         t_s = t_cam_s + stream.offset_s
         self._measure(stream, frame, t_s)

@@ -55,13 +55,11 @@ class PlanarPoses:
 
     Attributes:
         candidates: None, one or two poses.
-        ambiguous: The data cannot tell the two apart at five sigma.
-        reason: Why there is no candidate, in words; empty otherwise.
+        ambiguous: The data cannot tell the two apart at six sigma.
     """
 
     candidates: tuple[PlanarPose, ...]
     ambiguous: bool = False
-    reason: str = ""
 
 
 class _Views(NamedTuple):
@@ -122,16 +120,11 @@ def planar_poses(
         parts = [slice(k, k + _TOGETHER) for k in range(0, len(xy), _TOGETHER)]
         return [found for part in parts for found in planar_poses(points_m[part], xy[part], sigma)]
     views = _Views.of(points_m, xy)
-    out = [PlanarPoses((), reason=f"{int(n)} points: a pose needs at least 4") for n in views.points]
+    out = [PlanarPoses(()) for _ in xy]
     left = np.flatnonzero(views.points >= 4)
     extent = np.linalg.eigvalsh(views.plane[left] @ np.swapaxes(views.plane[left], 1, 2))
-    line = extent[:, 0] <= _COLLINEAR**2 * extent[:, 1]
-    for k in left[line]:
-        out[k] = PlanarPoses((), reason="the points lie on one line: show more rows of the target")
-    left = left[~line]
+    left = left[extent[:, 0] > _COLLINEAR**2 * extent[:, 1]]
     H, found = _homographies(views.only(left))
-    for k in left[~found]:
-        out[k] = PlanarPoses((), reason="no homography fits the points")
     left = left[found]
     views = views.only(left)
     R, p = _both_poses(H[found], views)
@@ -337,7 +330,7 @@ def _rank(
 ) -> PlanarPoses:
     order = sorted(np.flatnonzero(np.isfinite(rms)).tolist(), key=lambda i: float(rms[i]))
     if not order:
-        return PlanarPoses((), reason="the points lie behind the camera")
+        return PlanarPoses(())
     if same:
         order = order[:1]
     best = rms[order[0]]

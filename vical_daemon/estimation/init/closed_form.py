@@ -16,10 +16,10 @@ from vical_daemon.estimation.init.accel_alignment import (
     ROTATION_SIGMA_RAD,
     SHIFT_SIGMA_S,
     Alignment,
+    CameraPath,
     align,
     align_at,
 )
-from vical_daemon.estimation.init.accel_evidence import CameraPath
 from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes

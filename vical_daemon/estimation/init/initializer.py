@@ -13,10 +13,9 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
-from vical_daemon.estimation.init.attempts import Attempts
+from vical_daemon.estimation.init.attempts import Attempts, RestDetector
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
-from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, Frames, PointsFrame

@@ -24,7 +24,6 @@ class FrameReport:
         nis: Normalised innovation squared of what the state can explain.
         dof: Its degrees of freedom.
         sigma_px: Corner noise of this image as used, px.
-        reason: Why a frame was refused; empty otherwise.
         predicted_px: Where the points were expected before the update, shape (n, 2); not-a-number where
             they could not be.
         log_likelihood: Of the image by what was predicted, up to a constant.
@@ -40,6 +39,5 @@ class FrameReport:
     nis: float = 0.0
     dof: int = 0
     sigma_px: float = 0.0
-    reason: str = ""
     predicted_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     log_likelihood: float = 0.0

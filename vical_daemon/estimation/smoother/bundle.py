@@ -17,10 +17,11 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -28,8 +29,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     calibration_difference,
     carried_out,
 )
-from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem, View
-from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
+from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
 _OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
@@ -368,3 +368,76 @@ def _in_place(H: FloatArray) -> tuple[FloatArray, int]:
     """
     root, info = dpotrf(H.T, lower=1, overwrite_a=1, clean=0)
     return root, int(info)
+
+
+_MEMORY = 25  # images over which an error of the pixels may last
+
+
+def correlation(e: FloatArray, seen: Seen) -> float:
+    """By how much the variance of a track's mean error exceeds that of white noise: 1 + 2 sum rho_k.
+
+    Errors that stay with a feature from image to image (lens, tracker, blur) count once, not once an image.
+    The sum ends where the correlation is lost in its own noise. [Geyer, "Practical Markov chain Monte
+    Carlo", 1992, initial positive sequence]
+    """
+    e = e * huber_weight(np.sqrt((e**2).sum(axis=1, keepdims=True)), HUBER)
+    variance = float((e**2).mean())
+    total = 1.0
+    for k in range(1, _MEMORY):
+        if len(e) <= k:
+            break
+        same = (seen.landmark[k:] == seen.landmark[:-k]) & (seen.frame[k:] - seen.frame[:-k] == k)
+        count = int(same.sum())
+        if count < 50:
+            break
+        rho = float((e[k:][same] * e[:-k][same]).sum()) / (2.0 * count * max(variance, 1e-12))
+        if rho < 2.0 / np.sqrt(2.0 * count):
+            break
+        total += 2.0 * rho
+    return total
+
+
+def parallax_deg(window: Window, seen: Seen) -> float:
+    """Median angle between the first and last ray of the landmarks, deg."""
+    last = np.concatenate([seen.begin[1:], [len(seen.frame)]]) - 1
+    m = window.landmarks
+    X = m.bearing + m.inverse[:, None] * m.anchor
+    ends = [X - m.inverse[:, None] * window.p[seen.frame[at]] for at in (seen.begin, last)]
+    a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12) for x in ends)
+    return float(np.rad2deg(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0)))))
+
+
+def window_reports(problem: Problem, view: View) -> list[FrameReport]:
+    """Residuals of every image with landmarks in it, in order of time.
+
+    Args:
+        problem: Of the adjusted window.
+        view: Its values at the observations it used.
+
+    Returns:
+        One report an image, without predictions: a window is adjusted after its images.
+    """
+    window = problem.window
+    seen, ok, e = view.seen, view.valid, problem.pixel_errors(view)[0]
+    residual = np.where(ok[:, None], -e * problem.noise.sigma_px, np.nan)
+    out = []
+    ends = np.append(seen.frame_begin[1:], len(seen.frame))
+    for frame, begin, end in zip(seen.frames_with, seen.frame_begin, ends, strict=True):
+        rows = seen.by_frame[begin:end]
+        image = window.frames[int(frame)][1]
+        squares = float((e[rows][ok[rows]] ** 2).sum())
+        out.append(
+            FrameReport(
+                image.t_cam_ns,
+                image.camera,
+                window.landmarks.ids[seen.landmark[rows]],
+                seen.uv[rows],
+                residual[rows],
+                ok[rows],
+                True,
+                squares,
+                2 * int(ok[rows].sum()),
+                problem.noise.sigma_px,
+            )
+        )
+    return out

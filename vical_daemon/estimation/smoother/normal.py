@@ -84,7 +84,7 @@ class ImageNoise(NamedTuple):
         sigma_px: Of a feature, px.
         spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
         jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
-        lens_px: Misfit of the lens model, see `lens_misfit`, px.
+        lens_px: Misfit of the lens model, see `LensMisfit`, px.
         alike: Correlation of what the stamps of neighbouring images are off by, as measured.
     """
 

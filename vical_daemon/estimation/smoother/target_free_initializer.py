@@ -14,10 +14,9 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
-from vical_daemon.estimation.init.attempts import LONG_S, Attempts
+from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
-from vical_daemon.estimation.init.rest import MOVED_PX
 from vical_daemon.estimation.measurements import (
     IMAGE_GAP_S,
     CalibrationOptions,

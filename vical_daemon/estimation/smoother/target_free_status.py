@@ -12,7 +12,7 @@ from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
-from vical_daemon.estimation.noise.lens_misfit import WINDOWS
+from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT

@@ -93,7 +93,7 @@ class Window:
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
         imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
-        own_lens: What fx fy cx cy and the distortion differ by in this window, see `lens_misfit`, shape (n,).
+        own_lens: What fx fy cx cy and the distortion differ by in this window, see `LensMisfit`, shape (n,).
         jumps: See `MarginalPrior`.
         turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
     """

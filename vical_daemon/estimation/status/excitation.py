@@ -85,34 +85,6 @@ class RunningMotion:
         return float(np.sqrt(self._change)) if self._changes else None
 
 
-def weak_directions(
-    pose_covariance: FloatArray,
-    R_imu_cam: FloatArray,
-    timeshift_sigma_s: float,
-    motion: RunningMotion,
-    limits: ConvergenceTargets,
-    bias_rps: FloatArray | None = None,
-) -> list[WeakDirection]:
-    """Find what is not known well enough, worst first, with the motion that would reveal it.
-
-    Args:
-        pose_covariance: Of T_imu_cam, order [p r], m and rad (rotation local), shape (6, 6).
-        R_imu_cam: Present mounting, shape (3, 3).
-        timeshift_sigma_s: Standard deviation of the time shift, s.
-        motion: How the rig turned.
-        limits: What is good enough.
-        bias_rps: The gyro's bias, shape (3,).
-
-    Returns:
-        The directions; empty when everything is known well enough.
-    """
-    covariance = np.zeros((7, 7))
-    covariance[:6, :6], covariance[6, 6] = pose_covariance, timeshift_sigma_s**2
-    scatter = motion.scatter(bias_rps)
-    found = missing_motion(covariance, R_imu_cam, scatter, motion.rate_change_rps2, limits)
-    return sorted(found, key=lambda m: -m.excess)
-
-
 def excitation_advice(
     motion: RunningMotion, R_imu_cam: FloatArray | None, bias_rps: FloatArray | None = None
 ) -> Guidance:
@@ -135,40 +107,38 @@ def excitation_advice(
     return Guidance()
 
 
-def missing_motion(
-    covariance: FloatArray,
+def weak_directions(
+    pose_covariance: FloatArray,
     R_imu_cam: FloatArray,
-    rate_scatter: FloatArray,
-    rate_change_rps2: float | None = None,
+    timeshift_sigma_s: float,
+    motion: RunningMotion,
     limits: ConvergenceTargets = WIDE,
+    bias_rps: FloatArray | None = None,
 ) -> list[WeakDirection]:
-    """Find which directions of a calibration are not known, and what motion would reveal them.
+    """Find which directions of a calibration are not known, worst first, and what motion would reveal them.
 
     Args:
-        covariance: Of [p_imu_cam (3, imu frame, m), R_imu_cam (3, local, rad), time shift (s)], shape (7, 7).
-        R_imu_cam: Mounting, shape (3, 3).
-        rate_scatter: Mean of w w' over the data, w the bias-free rate in the imu frame, (rad/s)^2, shape (3,
-            3).
-        rate_change_rps2: RMS angular acceleration, rad/s^2; None: not known.
+        pose_covariance: Of T_imu_cam, order [p r], m and rad (rotation local), shape (6, 6).
+        R_imu_cam: Present mounting, shape (3, 3).
+        timeshift_sigma_s: Standard deviation of the time shift, s.
+        motion: How the rig turned.
         limits: Above which sigma a direction counts as unknown.
-
-    Returns:
-        The directions, worst first within each block; empty when all is known.
+        bias_rps: The gyro's bias, shape (3,).
     """
-    turning = _Turning.of(rate_scatter, R_imu_cam)
+    turning = _Turning.of(motion.scatter(bias_rps), R_imu_cam)
     found: list[WeakDirection] = []
-    in_cam = R_imu_cam.T @ covariance[:3, :3] @ R_imu_cam
+    in_cam = R_imu_cam.T @ pose_covariance[:3, :3] @ R_imu_cam
     for sigma, axis in _beyond(in_cam, limits.position_m):
         advice = turning.for_lever_arm(axis)
         found.append(WeakDirection(Block.LEVER_ARM, _plain(axis), sigma, limits.position_m, advice))
-    for sigma, axis in _beyond(covariance[3:6, 3:6], limits.rotation_rad):
+    for sigma, axis in _beyond(pose_covariance[3:, 3:], limits.rotation_rad):
         advice = turning.for_rotation(axis)
         found.append(WeakDirection(Block.ROTATION, _plain(axis), sigma, limits.rotation_rad, advice))
-    sigma_t = float(np.sqrt(covariance[6, 6]))
-    if sigma_t > limits.timeshift_s:
-        advice = turning.for_timeshift(rate_change_rps2)
-        found.append(WeakDirection(Block.TIMESHIFT, (0.0, 0.0, 0.0), sigma_t, limits.timeshift_s, advice))
-    return found
+    if timeshift_sigma_s > limits.timeshift_s:
+        advice = turning.for_timeshift(motion.rate_change_rps2)
+        nowhere = (0.0, 0.0, 0.0)
+        found.append(WeakDirection(Block.TIMESHIFT, nowhere, timeshift_sigma_s, limits.timeshift_s, advice))
+    return sorted(found, key=lambda m: -m.excess)
 
 
 def _plain(axis: FloatArray) -> tuple[float, float, float]:

@@ -83,7 +83,7 @@ class Linear:
     """The linearised problem in order of time, before scaling of the noises.
 
     Attributes:
-        problem: With unscaled weights; its steps' noise is set by `orientation_noise.scaled`.
+        problem: With unscaled weights; its steps' noise is set by `orientation_fit.scaled`.
         sensor: Which sensor each row belongs to, shape (n,).
         order: Sorted row to row of the sensors strung together, shape (n,).
         used: Rows that take part, shape (n,).

@@ -98,12 +98,12 @@ def test_a_frontal_board_at_the_centre_needs_no_luck():
     np.testing.assert_allclose(result.candidates[0].p_cam_target, [0, 0, 0.7], atol=1e-7)
 
 
-def test_too_few_points_a_line_and_points_at_one_place_are_refused_in_words():
+def test_too_few_points_a_line_and_points_at_one_place_have_no_pose():
     board = _board(8, 6, 0.05)
     xy = _image(board, np.eye(3), np.array([0.0, 0.0, 0.7]))
-    assert "at least 4" in planar_pose(board[:3], xy[:3]).reason
-    assert "one line" in planar_pose(board[:8], xy[:8]).reason
-    assert "homography" in planar_pose(board, np.zeros_like(xy)).reason
+    assert planar_pose(board[:3], xy[:3]).candidates == ()
+    assert planar_pose(board[:8], xy[:8]).candidates == ()
+    assert planar_pose(board, np.zeros_like(xy)).candidates == ()
     xy[5:] = np.nan
     assert planar_pose(board, xy).candidates == ()
 
@@ -131,7 +131,7 @@ def test_views_of_a_batch_are_what_each_is_alone():
     assert planar_poses([], []) == []
     for together, xy, seen in zip(planar_poses(points, views), points, views, strict=True):
         alone = planar_pose(xy, seen)
-        assert (together.reason, together.ambiguous) == (alone.reason, alone.ambiguous)
+        assert together.ambiguous == alone.ambiguous
         for one, other in zip(together.candidates, alone.candidates, strict=True):
             np.testing.assert_allclose(one.R_cam_target, other.R_cam_target, atol=1e-6)
             np.testing.assert_allclose(one.p_cam_target, other.p_cam_target, atol=1e-6)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from vical_mocks.points import board_points
 
+from vical_daemon.estimation.init.attempts import RestDetector
 from vical_daemon.estimation.init.initializer import Initializer
-from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 

@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 from vical_daemon.estimation.noise import consistency
 from vical_daemon.estimation.noise.consistency import Consistency, modes
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
-from vical_daemon.estimation.status.drift_watch import DriftWatch
+from vical_daemon.estimation.status.change_watch import DriftWatch
 
 UV = np.stack(np.meshgrid(np.linspace(100, 400, 8), np.linspace(80, 300, 6)), -1).reshape(-1, 2)
 SIGMA = np.full(len(UV), 0.5)

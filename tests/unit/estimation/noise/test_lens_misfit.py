@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, limit, patches
-from vical_daemon.estimation.noise.lens_misfit import LensMisfit
+from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, LensMisfit, limit, patches
 
 CAMERA = CameraState(
     np.eye(3), np.zeros(3), 0.0, np.array([520.0, 520.0, 323.0, 238.0]),

@@ -11,7 +11,7 @@ from vical_mocks.points import simulate
 
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.status.drift_watch import DriftWatch
+from vical_daemon.estimation.status.change_watch import DriftWatch
 
 SIZE_S, PERIOD_S = 4e-3, 10.0
 

@@ -1,4 +1,4 @@
-"""shutter_axis.py: columns are tried where they explain more than chance, in the first window and later."""
+"""first_window.py: columns are tried where they explain more than chance, in the first window and later."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from vical_mocks.tracks import simulate_tracks
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions
 from vical_daemon.estimation.smoother import first_window
-from vical_daemon.estimation.smoother.shutter_axis import readout_sigmas, shows_columns
+from vical_daemon.estimation.smoother.first_window import readout_sigmas, shows_columns
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.smoother.thinning import Thinning
+from vical_daemon.estimation.smoother.waiting_tracks import Thinning
 
 
 def stamps(rate_hz: float, jitter_s: float = 0.0, seconds: float = 60.0):

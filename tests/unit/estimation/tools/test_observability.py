@@ -1,5 +1,7 @@
 """Known results of observability along motions (Gramian); guidance."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,6 @@ from vical_daemon.estimation.status.excitation import (
     WIDE,
     RunningMotion,
     excitation_advice,
-    missing_motion,
     weak_directions,
 )
 from vical_daemon.estimation.tools.observability import (
@@ -142,12 +143,18 @@ def _covariance(arm=(1e-3,) * 3, rotation=(1e-3,) * 3, shift=1e-4):
     return C
 
 
+def _weak(covariance, scatter, change_rps2=None, limits=WIDE):
+    """`weak_directions` of a motion of which scatter and change of the rates are given."""
+    motion = SimpleNamespace(scatter=lambda _: scatter, rate_change_rps2=change_rps2)
+    return weak_directions(covariance[:6, :6], R_IMU_CAM, np.sqrt(covariance[6, 6]), motion, limits)
+
+
 def _scatter(*rates_cam):
     return sum(np.outer(R_IMU_CAM @ np.array(w), R_IMU_CAM @ np.array(w)) for w in rates_cam)
 
 
 def test_guidance_names_the_optical_axis_and_another_rotation():
-    found = missing_motion(_covariance(arm=(1e-3, 1e-3, 0.5)), R_IMU_CAM, _scatter((0, 0, 0.7)))
+    found = _weak(_covariance(arm=(1e-3, 1e-3, 0.5)), _scatter((0, 0, 0.7)))
     assert direction_line(found[0]) == (
         "lever arm along the optical axis: "
         "so far it turned about the optical axis only; rotate about another axis"
@@ -156,19 +163,18 @@ def test_guidance_names_the_optical_axis_and_another_rotation():
 
 
 def test_guidance_says_nothing_when_all_is_known():
-    assert missing_motion(_covariance(), R_IMU_CAM, _scatter((0.5, 0, 0), (0, 0.5, 0))) == []
+    assert _weak(_covariance(), _scatter((0.5, 0, 0), (0, 0.5, 0))) == []
 
 
 def test_guidance_for_standing_still_slow_and_steady_motion():
-    still = missing_motion(_covariance((1, 1, 1), (1, 1, 1), 1.0), R_IMU_CAM, 1e-6 * np.eye(3))
+    still = _weak(_covariance((1, 1, 1), (1, 1, 1), 1.0), 1e-6 * np.eye(3))
     assert len(still) == 7 and all(m.guidance.lack is Lack.STILL for m in still)
-    slow = missing_motion(_covariance(arm=(0.01, 1e-3, 1e-3)), R_IMU_CAM, 0.005 * np.eye(3))
+    slow = _weak(_covariance(arm=(0.01, 1e-3, 1e-3)), 0.005 * np.eye(3))
     assert slow[0].guidance.verb is Verb.TURN_FASTER and axis_name(slow[0].axis_cam) == "the image's x axis"
-    steady = missing_motion(_covariance(shift=0.01), R_IMU_CAM, _scatter((0, 0.7, 0)), rate_change_rps2=0.01)
+    steady = _weak(_covariance(shift=0.01), _scatter((0, 0.7, 0)), 0.01)
     assert steady[0].guidance.verb is Verb.TURN_TO_AND_FRO and steady[0].block is Block.TIMESHIFT
-    tilted = missing_motion(
+    tilted = _weak(
         _covariance(rotation=(1e-3, 0.2, 1e-3)),
-        R_IMU_CAM,
         _scatter((0, 0.7, 0)),
         limits=ConvergenceTargets(rotation_rad=0.01),
     )
