@@ -31,7 +31,6 @@ from vical_daemon.estimation.filter import snapshot as board_snapshot
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import ImageIntake
 from vical_daemon.estimation.inertial import clipped_readings
-from vical_daemon.estimation.inertial.clipped_readings import ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
@@ -262,12 +261,6 @@ BOARD: dict[str, Mechanism] = {
         WRONG,
         "readings at the end of the range",
         lambda: [(RangeLimits, "at_range", gives(()))],
-        faults=("gyro clips",),
-    ),
-    "imu clipped: error of the cubic": Mechanism(
-        WRONG,
-        "how much the same cubic misses where the truth is known",
-        lambda: [(ClippedReadings, "_missed", gives(0.0))],
         faults=("gyro clips",),
     ),
     "imu clipped: beyond the range": Mechanism(

@@ -2,30 +2,24 @@
 
 A channel at its range shows that the motion is beyond it, and no more. Its value there is that of a cubic
 through the readings on either side. It may also be anything from the range to twice as far beyond as the
-cubic is at most. And the cubic misses, as it did of late over as many readings within the range. Both errors
-are common to the readings of a run. The other channels keep what they measured.
+cubic is at most: an error common to the readings of a run. The other channels keep what they measured.
 [docs/math/filter.md]
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from vical_daemon.estimation.inertial.faulty_readings import Six
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
 _SIDE_NS, _LEAST = 20_000_000, 2
 """A run ends with so many readings of the channel within its range, over so long a time; the cubic is fitted
 to as many on either side."""
-_ALIKE_NS = 2_000_000_000  # over so long before a run the motion is taken as of the same kind
-_ENOUGH = 8  # stretches within the range by which the error of the cubic is known
 _EVEN = 3.0**-0.5  # one sigma of an even distribution over half its width
 _LONGEST_NS = 1_000_000_000
 """Of a run that is bridged: until it ends, its readings and the images of that time wait."""
@@ -101,7 +95,7 @@ class ClippedReadings:
     """Bridges clipped readings of one stream; readings come out in order, those in and after a run later."""
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[int, Six, Sequence[int]]] = deque()
+        self._recent: deque[tuple[int, Six]] = deque()
         self._held: deque[_Held] = deque()
         self._runs: dict[int, _Run] = {}
 
@@ -121,8 +115,8 @@ class ClippedReadings:
             out = self._settled()
         else:
             out = [Bridged(t_ns, six)]
-        self._recent.append((t_ns, six, at_range))
-        if self._recent[0][0] < t_ns - _ALIKE_NS:
+        self._recent.append((t_ns, six))
+        if self._recent[0][0] < t_ns - _LONGEST_NS:
             self._recent.popleft()
         return out
 
@@ -146,7 +140,7 @@ class ClippedReadings:
 
     def _before(self, t_ns: int, channel: int) -> list[tuple[int, float]]:
         near: list[tuple[int, float]] = []
-        for s, six, _ in reversed(self._recent):
+        for s, six in reversed(self._recent):
             if s < t_ns - (_SIDE_NS if len(near) >= _LEAST else _LONGEST_NS):
                 break
             near.append((s, six[channel]))
@@ -168,41 +162,17 @@ class ClippedReadings:
         values = np.array([*(x for _, x in run.before), *(x.six[channel] for x in run.readings)])
         clipped = np.array([False] * len(run.before) + run.clipped)
         # without an end: anything up to twice the range, and just beyond it where the run has only begun
-        half, missed = 0.5 * abs(rail), 0.0
+        half = 0.5 * abs(rail)
         beyond = np.full(len(t_ns), 0.0 if run.has_just_begun else half)
         if run.after >= _LEAST and len(run.before) >= _LEAST:
             u = (t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0])
             powers = np.stack([np.ones_like(u), u, u * u, u**3], axis=1)
             cubic = powers @ np.linalg.pinv(powers[~clipped])
             beyond = np.copysign(1.0, rail) * (cubic @ values[~clipped] - rail)
-            half, missed = float(np.abs(beyond[clipped]).max()), self._missed(channel, clipped, cubic)
-        sigma = math.hypot(_EVEN * half, missed)
+            half = float(np.abs(beyond[clipped]).max())
         for reading, off, is_clipped in zip(
             run.readings, beyond[len(run.before) :], run.clipped, strict=True
         ):
             if is_clipped:
                 reading.six[channel] = rail + float(np.copysign(max(off, 0.0), rail))
-                reading.clipping_sigma[channel] = sigma
-
-    def _missed(self, channel: int, clipped: BoolArray, cubic: FloatArray) -> float:
-        """Error of a cubic, mean over a run, where readings within the range were bridged in the same way.
-
-        Args:
-            channel: Of the six.
-            clipped: Which readings of the run are bridged, shape (m,).
-            cubic: Its values by the other readings, shape (m, n).
-
-        Returns:
-            Root mean square over the latest stretches; 0 where there are too few.
-        """
-        if len(self._recent) < len(clipped):
-            return 0.0
-        values = np.array([six[channel] for _, six, _ in self._recent])
-        unknown = np.array([channel in at_range for _, _, at_range in self._recent])
-        stretches = sliding_window_view(values, len(clipped))
-        stretches = stretches[~sliding_window_view(unknown, len(clipped)).any(axis=1)]
-        if len(stretches) < _ENOUGH:
-            return 0.0
-        weights = np.zeros(len(clipped))
-        weights[~clipped], weights[clipped] = cubic[clipped].mean(axis=0), -1.0 / clipped.sum()
-        return float(np.sqrt(((stretches @ weights) ** 2).mean()))
+                reading.clipping_sigma[channel] = _EVEN * half

@@ -47,21 +47,6 @@ def test_a_cubic_motion_is_restored_exactly_and_bounded_by_the_range(sign) -> No
     assert [x.clipping_sigma is not None for x in out] == (np.abs(rate) > RAIL).tolist()
 
 
-def test_what_the_cubic_misses_is_measured_where_the_truth_is_known() -> None:
-    """Motion that is no cubic, and goes just beyond the range: runs are off by what is stated."""
-    rng, k = np.random.default_rng(3), np.arange(12000)
-    slow, fast = 0.95 * np.sin(0.02 * k), 0.1 * np.sin(0.5 * k + np.cumsum(rng.normal(0.0, 0.1, len(k))))
-    rate = slow + fast
-    out = bridged(rate)
-    error = np.array([x.six[0] for x in out]) - rate
-    sigma = np.array([0.0 if x.clipping_sigma is None else x.clipping_sigma[0] for x in out])
-    edges = np.flatnonzero(np.diff((sigma > 0.0).astype(int)))
-    runs = [slice(a + 1, b + 1) for a, b in zip(edges[::2], edges[1::2], strict=False)]
-    z = np.array([error[run].mean() / sigma[run].max() for run in runs[5:]])
-    assert len(z) > 50
-    assert 0.4 < np.sqrt((z**2).mean()) < 1.2
-
-
 def test_two_channels_wait_for_each_other_and_keep_their_own_runs() -> None:
     t = np.arange(216) * 5e-3  # ends within the range of both
     a, b = 1.3 * np.sin(8.0 * t), 1.2 * np.sin(8.0 * t + 0.6)
