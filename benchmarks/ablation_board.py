@@ -70,7 +70,7 @@ def _not_moved(self: Any) -> None:
 def _no_drift() -> list[tuple[Any, ...]]:
     return [
         (start_sigmas, "SKEW_SIGMA", HARDLY * start_sigmas.SKEW_SIGMA),
-        (clock_drift, "_evidence", gives(0.0)),
+        (clock_drift, "probability", gives(0.0)),
     ]
 
 
@@ -81,8 +81,8 @@ def _same(f: CalibrationFilter) -> CalibrationFilter:
 def _always_drift() -> list[tuple[Any, ...]]:
     return [
         (clock_drift, "apart", gives(1.0)),
-        (clock_drift, "_evidence", gives(0.0)),
-        (change_watch, "surely_apart", gives(False)),
+        (clock_drift, "in_doubt", gives(False)),
+        (change_watch, "apart", gives(0.0)),
         (clock_drift, "averaged", _same),
     ]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from vical_daemon.estimation.events import Cause, Event, EventKind
@@ -274,8 +275,8 @@ def _of(event: Event, factor: float, unit: str, form: str) -> str:
 
 def _size(event: Event, factor: float, unit: str, form: str) -> str:
     """The same without the sign."""
-    value = format(factor * abs(math.nan if event.value is None else event.value), form)
-    return f"{value} {unit}" if event.sigma is None else f"{value} ± {factor * event.sigma:{form}} {unit}"
+    size = None if event.value is None else abs(event.value)
+    return _of(replace(event, value=size), factor, unit, form)
 
 
 def _target_size(event: Event) -> str:

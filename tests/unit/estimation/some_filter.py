@@ -14,11 +14,13 @@ from vical_daemon.estimation.model.state import LOWER, CameraState, State, make_
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.selection.model_mixture import not_zero
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
     LAG,
     SIZE,
     TARGET,
+    weights,
 )
 
 NAME = "cam0"
@@ -40,6 +42,11 @@ class Dense:
 
     def information(self):
         return self.H.T @ self.H / self.noise**2
+
+
+def off(f, name):
+    """Probability that a block of alternative models is not zero."""
+    return not_zero(weights(f), name)
 
 
 def some_filter(imu=1.0, target=0.0, lag=0.0, size=0.0, factor=1.0, scale=1.0):

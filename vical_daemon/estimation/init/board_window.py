@@ -107,19 +107,18 @@ class Whitened(NamedTuple):
     square: float
 
 
-class Linked(NamedTuple):
-    """Links about the present values: errors (F - 1, 9), derivatives by both motions and the constants."""
-
-    e: FloatArray
-    by_motion: FloatArray  # (F - 1, 9, 18)
-    by_constants: FloatArray  # (F - 1, 9, c)
-
-
 class Present(NamedTuple):
-    """All of a window about the present values."""
+    """All of a window about the present values.
+
+    Attributes:
+        views: Its images.
+        missed: Whitened errors of the links, shape (F - 1, 9).
+        by_link: Their derivatives by the motion at both ends and the constants, shape (F - 1, 9, 18 + c).
+    """
 
     views: list[View]
-    linked: Linked
+    missed: FloatArray
+    by_link: FloatArray
 
 
 class BoardWindow:
@@ -305,7 +304,7 @@ class BoardWindow:
         """Everything about the present values; None where an image shows too few corners."""
         views = [self._view(k, t, frame) for k, node in enumerate(self.nodes) for t, frame in node.frames]
         good = [v for v in views if v is not None]
-        return Present(good, self._linked()) if len(good) == len(views) else None
+        return Present(good, *self._linked()) if len(good) == len(views) else None
 
     def _view(self, k: int, t_cam_s: float, frame: PointsFrame) -> View | None:
         node, name = self.nodes[k], frame.camera
@@ -332,7 +331,8 @@ class BoardWindow:
             alike = ways @ (by_error @ (shared_ways(state, self.layout, name) * self.shared[name]))
         return View(k, name, residual, relative, seen, ways, by_error, alike)
 
-    def _linked(self) -> Linked:
+    def _linked(self) -> tuple[FloatArray, FloatArray]:
+        """See `Present`: missed, by_link."""
         s, layout, links = self.state, self.layout, self._links
         R, p, v = (np.array([getattr(n.at, name) for n in self.nodes]) for name in "Rpv")
         numbers = _numbers(s)
@@ -347,7 +347,7 @@ class BoardWindow:
             full[:, :, layout.gyro_matrix.start : layout.accel_matrix.stop] = J[:, :, 24:39]
         if layout.accel_lag is not None:
             full[:, :, layout.accel_lag] = J[:, :, 39]
-        return Linked(e, J[:, :, :18], full[:, :, MOTION.stop :])
+        return e, np.concatenate([J[:, :, :18], full[:, :, MOTION.stop :]], axis=2)
 
     def normal(
         self, now: Present, images: list[Whitened], *, together: bool = True
@@ -380,8 +380,7 @@ class BoardWindow:
                 known = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, np.column_stack([across, A.T @ r]))
                 information, right = information - across.T @ known[:, :-1], right - across.T @ known[:, -1]
             add(view.by_error.T @ information @ view.by_error, view.by_error.T @ right, 9 * view.node)
-        for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
-            J = np.concatenate([by_motion, by_constants], axis=1)
+        for k, (e, J) in enumerate(zip(now.missed, now.by_link, strict=True)):
             add(J.T @ J, -J.T @ e, 9 * k)
         H[F:, F:] += self._information
         g[F:] -= self._information @ self.offset
@@ -414,7 +413,7 @@ class BoardWindow:
 
     def _cost(self, now: Present, images: list[Whitened]) -> float:
         """Sum of squares."""
-        cost = float((now.linked.e**2).sum() + self.offset @ self._information @ self.offset)
+        cost = float((now.missed**2).sum() + self.offset @ self._information @ self.offset)
         return cost + sum(image.square for image in images)
 
     def _learn_noise(self, views: list[View], images: list[Whitened]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SKEW_WALK, SURE
+from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SKEW_WALK
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.selection.model_mixture import joined, parts
 from vical_daemon.estimation.selection.model_selection import factor, lenses_known
@@ -27,31 +27,23 @@ _LEAST_S = 1.0
 
 def apart(f: CalibrationFilter, camera: str) -> float:
     """Probability that this camera's clock drifts against the imu's; 1 where that was announced."""
-    return 1.0 if camera in f.drifting else probability(_evidence(f, camera))
+    index = f.layout.cameras[camera].skew
+    if camera in f.drifting or index is None:
+        return float(camera in f.drifting)
+    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + _stamps(f)
+    return probability(f.state.cameras[camera].skew, variance)
 
 
-def evidence(skew: float, variance: float) -> float:
-    """Return how much more likely data are if a clock drifts than if it does not (Bayes factor).
+def probability(skew: float, variance: float) -> float:
+    """Return the probability of a drift, by the Bayes factor of a drift against none.
 
     Args:
         skew: Drift as estimated with a prior of `SKEW_SIGMA`, s/s.
         variance: Of that estimate.
     """
-    return float(np.sqrt(variance) / SKEW_SIGMA * np.exp(0.5 * min(skew**2 / variance, 200.0)))
-
-
-def probability(bayes_factor: float) -> float:
-    """Return the probability of a drift."""
+    bayes_factor = float(np.sqrt(variance) / SKEW_SIGMA * np.exp(0.5 * min(skew**2 / variance, 200.0)))
     odds = OFF / (1.0 - OFF) * bayes_factor
     return odds / (1.0 + odds)
-
-
-def _evidence(f: CalibrationFilter, camera: str) -> float:
-    index = f.layout.cameras[camera].skew
-    if index is None:
-        return 0.0
-    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + _stamps(f)
-    return evidence(f.state.cameras[camera].skew, variance)
 
 
 def _stamps(f: CalibrationFilter) -> float:
@@ -70,23 +62,13 @@ def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
     return (2.0 * stamp_sigma_s / max(elapsed_s, _LEAST_S)) ** 2
 
 
-def doubtful(bayes_factor: float, *, believed: bool) -> bool:
-    """Whether the data speak for a drift, though not yet surely: nothing to call converged.
+def in_doubt(f: CalibrationFilter, camera: str, *, believed: bool) -> bool:
+    """Whether data speak for a drift that was not announced: nothing to call converged.
 
     A result that was believed stays so until a drift is more likely than none, as in
     `model_selection.in_doubt`.
     """
-    return probability(bayes_factor) > 0.5 or (bayes_factor > 1.0 and not believed)
-
-
-def in_doubt(f: CalibrationFilter, camera: str, *, believed: bool) -> bool:
-    """Whether the clock of this camera is `doubtful`, and no drift was announced."""
-    return camera not in f.drifting and doubtful(_evidence(f, camera), believed=believed)
-
-
-def surely_apart(f: CalibrationFilter, camera: str) -> bool:
-    """Whether the drift is beyond doubt."""
-    return apart(f, camera) > SURE
+    return camera not in f.drifting and apart(f, camera) > (0.5 if believed else OFF)
 
 
 def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
@@ -120,7 +102,7 @@ def averaged(f: CalibrationFilter) -> CalibrationFilter:
         over, spread, skew = factor(f), f.consistency[name].factor, f.state.cameras[name].skew
         S, off = parts(f.S, over) if f.layout.held else (f.S, np.zeros(len(f.S)))
         variance = spread * float(S[where.skew] @ S[where.skew]) + _stamps(f)
-        p = probability(evidence(skew + off[where.skew], variance))
+        p = probability(skew + off[where.skew], variance)
         given = lenses_known(replace(f, S=S))
         step, S, off = mixture(S, off, given, where.skew, skew, p, spread)
         S = joined(S, off, over) if f.layout.held else S

@@ -78,11 +78,6 @@ def weights(f: CalibrationFilter) -> Weights:
     return model_mixture.hypotheses(f.S, doubtful, factor(f) * misfit(f))
 
 
-def off(f: CalibrationFilter, name: str) -> float:
-    """Probability that a block is not zero; 1 where that was announced, or it was asked for."""
-    return not_zero(weights(f), name)
-
-
 def in_doubt(f: CalibrationFilter, shares: Weights | None = None, *, believed: bool = False) -> str:
     """Name of a block for which the data speak, though not yet surely: they soon will. Empty: none.
 

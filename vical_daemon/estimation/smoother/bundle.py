@@ -20,7 +20,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
-from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left
@@ -104,9 +103,8 @@ class _Present:
         self.damping = max(0.01 * self.damping, _DAMPING)
 
 
-_Saved = tuple[
-    FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray, FloatArray, FloatArray
-]
+_MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
+"""What a step changes of a window."""
 
 
 class Bundle:
@@ -164,14 +162,15 @@ class Bundle:
 
     def _tried(self, now: _Present, step: _Step) -> bool:
         """Take a step if it lowers the sum of squares; else damp the next one."""
-        saved = self._save()
+        before = {name: getattr(self.window, name) for name in _MOVED}
         there = self._applied(step, now.view.seen)
         trial = self.problem.normal(there)
         if np.isfinite(trial.cost) and trial.cost <= now.normal.cost:
             now.view, now.normal = there, trial
             now.relax()
             return True
-        self._restore(saved)
+        for name, value in before.items():
+            setattr(self.window, name, value)
         now.damping *= 100.0
         return False
 
@@ -185,14 +184,6 @@ class Bundle:
             now.view = self.problem.view(now.view.seen)
         now.normal = self.problem.normal(now.view)
         return now
-
-    def _save(self) -> _Saved:
-        w = self.window
-        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens, w.jumps
-
-    def _restore(self, s: _Saved) -> None:
-        w = self.window
-        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens, w.jumps = s
 
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

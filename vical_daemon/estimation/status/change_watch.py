@@ -17,7 +17,8 @@ import numpy as np
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.selection.clock_drift import stamps_variance, surely_apart
+from vical_daemon.estimation.model.priors import SURE
+from vical_daemon.estimation.selection.clock_drift import apart, stamps_variance
 from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_SIGMAS
 
 _SPAN = 20
@@ -159,7 +160,7 @@ class ChangeWatch:
         variance, walk = float(f.S[index] @ f.S[index]), float(f.walk[index])
         skew, factor = f.state.cameras[camera].skew, f.consistency[camera].factor
         changes = watch.drifts(t_s, skew, variance, factor, walk)
-        begins = camera not in f.drifting and surely_apart(f, camera)
+        begins = camera not in f.drifting and apart(f, camera) > SURE
         wanders = len(f.wandered.get(camera, ())) > 1
         if changes or ((begins or wanders) and watch.doubtful):
             self._drift.pop(camera)

@@ -6,12 +6,13 @@ from vical_mocks.points import board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 
 from tests.unit.estimation import test_calibrator
+from tests.unit.estimation.some_filter import off
 from tests.unit.estimation.test_calibrator import errors
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.selection.model_selection import TARGET, off
+from vical_daemon.estimation.selection.model_selection import TARGET
 
 BOARD = board_points()
 

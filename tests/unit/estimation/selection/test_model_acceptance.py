@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
+from tests.unit.estimation.some_filter import NAME, imu_entries, off, some_filter
 from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
-from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, off
+from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET
 from vical_daemon.estimation.wording import event_text
 
 

@@ -9,7 +9,7 @@ from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prio
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
+from tests.unit.estimation.some_filter import NAME, imu_entries, off, some_filter
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA, SURE
@@ -21,7 +21,6 @@ from vical_daemon.estimation.selection.model_selection import (
     TARGET,
     averaged,
     in_doubt,
-    off,
     weights,
 )
 
