@@ -37,13 +37,12 @@ from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
-from vical_daemon.estimation.status.recent_past import RecentPast
+from vical_daemon.estimation.status.recent_past import BEFORE_S, RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, lens_stepped, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
-_STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 
@@ -375,7 +374,7 @@ class Calibrator:
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera)
         self.filter = before
-        self._unproven = (f.state.t_s + _STANDS_S, camera, before.state.cameras[camera].timeshift_s)
+        self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self._set_shift(before, camera, fit)
         self._lose_motion()
         return True
@@ -392,7 +391,7 @@ class Calibrator:
             self._unproven = None
             self.evaluator.announce(lens_stepped(before, f, camera))
         else:
-            self._unproven = (f.state.t_s + _STANDS_S, camera, before.state.cameras[camera].timeshift_s)
+            self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self.watch.shift_reopened()
         self.evaluator.reopened(f.state.t_s)
         return True

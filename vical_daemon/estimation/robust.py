@@ -1,4 +1,4 @@
-"""Robust statistics: what a median says of a sigma, and weights of errors that may be outliers."""
+"""Robust statistics: what a median says of a sigma, weights of errors that may be outliers, iterations."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ MEDIAN_RAYLEIGH = float(np.sqrt(chdtri(2, 0.5)))
 """Of the length of two."""
 MEDIAN_CHI2, MEDIAN_CHI2_3 = float(chdtri(1, 0.5)), float(chdtri(3, 0.5))
 """Of a chi-square variable with one degree of freedom, and with three."""
+MOST_STEPS = 30
+"""Of an iteration that stops where nothing changes, mostly after fewer than ten."""
 
 
 def median(values: FloatArray) -> float:

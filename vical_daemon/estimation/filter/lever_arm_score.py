@@ -22,18 +22,16 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.state import ACCEL_BIAS, ATTITUDE, MOTION
+from vical_daemon.estimation.model.state import ATTITUDE, BIASES, MOTION
 from vical_daemon.estimation.model.unscented import unit
 
-MOTION_ERRORS = ACCEL_BIAS.stop
+MOTION_ERRORS = BIASES.stop
 """Number of errors of attitude, position, velocity and biases."""
 UNCERTAIN = 0.5
 """Share of the bias: it goes with the square of the gyro's noise, which a data sheet gives to a quarter."""
-_STEP = (
-    1e-3  # of a lever arm, m, or of a size, for differences: log det S is straight over a hundred times that
-)
+_STEP = 1e-3
+"""Of a lever arm, m, or of a size, for differences: log det S is straight over a hundred times that."""
 _STEPS = _STEP * so3.hat(so3.IDENTITY)
-_BIASES = np.arange(MOTION.stop, MOTION_ERRORS)
 
 
 @dataclass(slots=True)
@@ -63,7 +61,7 @@ class LeverArmScore:
         F, gained = np.eye(MOTION_ERRORS), np.zeros((MOTION_ERRORS, MOTION_ERRORS))
         F[MOTION] = slopes
         gained[MOTION, MOTION] = Q
-        gained[_BIASES, _BIASES] = walk
+        gained[BIASES, BIASES] = np.diag(walk)
         self.P = F @ self.P @ F.T + gained
 
     def update(

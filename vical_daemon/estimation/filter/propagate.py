@@ -21,10 +21,9 @@ from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.imu_scale import by_entries
 from vical_daemon.estimation.model.retract import motion_points
 from vical_daemon.estimation.model.state import (
-    ACCEL_BIAS,
     ATTITUDE,
+    BIASES,
     GRAVITY,
-    GYRO_BIAS,
     POSITION,
     VELOCITY,
     Layout,
@@ -32,8 +31,6 @@ from vical_daemon.estimation.model.state import (
     grp_from_rotation,
     rotation_from_grp,
 )
-
-_BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 
 
 class Propagated(NamedTuple):
@@ -90,13 +87,13 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
 def motion_slopes(state: State, relative: Strapdown, errors: Influence) -> FloatArray:
     """Derivatives of the motion at the end by that at the start and by constant biases, shape (9, 15)."""
     T = float(relative.t_s[-1])
-    F = np.zeros((9, ACCEL_BIAS.stop))
+    F = np.zeros((9, BIASES.stop))
     hats = so3.hat(np.array([relative.dp[0, -1], relative.dv[0, -1]]))
     F[ATTITUDE, ATTITUDE] = relative.dR[0, -1].T
     F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -state.R_world_imu @ hats
     F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = so3.IDENTITY
     F[POSITION, VELOCITY] = T * so3.IDENTITY
-    F[:, _BIASES] = errors.by_bias()
+    F[:, BIASES] = errors.by_bias()
     return F
 
 
@@ -111,13 +108,13 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     R, g = state.R_world_imu, state.gravity
     errors = influence(R, relative)
     F = np.zeros((9, len(S)))
-    F[:, : ACCEL_BIAS.stop] = motion_slopes(state, relative, errors)
+    F[:, : BIASES.stop] = motion_slopes(state, relative, errors)
     tilt = -so3.hat(g) @ state.tilt
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         readings = np.concatenate([segment.gyro - state.gyro_bias, segment.accel - state.accel_bias], axis=1)
         by = by_entries(errors, readings, state.gyro_matrix, state.accel_matrix)
-        F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
+        F[:, BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
     return Propagated(
@@ -127,6 +124,6 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         F @ S,
         np.zeros((9, 0)),
         errors,
-        F[:, : ACCEL_BIAS.stop],
+        F[:, : BIASES.stop],
         T,
     )

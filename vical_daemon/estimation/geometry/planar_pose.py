@@ -19,13 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
 MIN_POINTS = 8  # of a view: two tags, or corners enough to see an outlier among them
-_STEPS = 15
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
@@ -277,7 +276,7 @@ def _refine(
     cost, information, gradient = _linearised(R, p, views, moments)
     left = np.arange(len(R))
     with np.errstate(invalid="ignore"):
-        for _ in range(_STEPS):
+        for _ in range(MOST_STEPS):
             alive = np.isfinite(cost[left])
             A = np.where(alive[..., None, None], information[left], np.eye(6))
             A = A + np.eye(6) * (damping[left][..., None] * np.einsum("mcii->mci", A))[..., None, :]

@@ -41,15 +41,14 @@ from vical_daemon.estimation.model.inertial_links import (
 )
 from vical_daemon.estimation.model.rates import SLOPE_S, Rates
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
-from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
+from vical_daemon.estimation.model.state import BIASES, GRAVITY, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight, median
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mcclure_weight, median
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
-_MOST_STEPS = 20
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
@@ -188,7 +187,7 @@ class BoardWindow:
         """Levenberg-Marquardt until nothing changes; False where that is not reached."""
         now, damping = self.present(), 0.0
         images = [] if now is None else self.whitened(now)
-        for _ in range(_MOST_STEPS):
+        for _ in range(MOST_STEPS):
             if now is None:
                 return False
             self._learn_noise(now.views, images)
@@ -342,7 +341,7 @@ class BoardWindow:
         by_tilt = np.concatenate([np.zeros_like(tilt), -T * tilt, -0.5 * T * T * tilt], axis=1)
         full = np.zeros((len(e), 9, layout.size))
         full[:, :, GRAVITY] = links.root @ by_tilt
-        full[:, :, GYRO_BIAS.start : ACCEL_BIAS.stop] = J[:, :, 18:24]
+        full[:, :, BIASES] = J[:, :, 18:24]
         if layout.gyro_matrix is not None and layout.accel_matrix is not None:
             full[:, :, layout.gyro_matrix.start : layout.accel_matrix.stop] = J[:, :, 24:39]
         if layout.accel_lag is not None:

@@ -17,10 +17,10 @@ from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
 from vical_daemon.estimation.init.target_poses import ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.robust import MOST_STEPS
 
 MOST_VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
-_STEPS = 15
 _Poses = list[tuple[FloatArray, FloatArray]]
 # relative to fx for the first four; four for the distortion, and radtan's fifth
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
@@ -109,7 +109,7 @@ def adjusted(
     scale = _scale(lens)
     prior, cost, damping = theta.copy(), np.inf, 1e-3
     best = (theta, poses)
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         normal = _normal(views, poses, target, theta, lens.distortion_model)
         if normal is None:
             break

@@ -12,8 +12,8 @@ from vical_daemon.estimation.geometry.camera_model import (
     radtan_derivative,
 )
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
+from vical_daemon.estimation.robust import MOST_STEPS
 
-_NEWTON_STEPS = 25
 _PATCHES = (8, 6)
 _NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
 
@@ -141,7 +141,7 @@ def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArr
     xy = target * start[..., None]
     error = np.full(shape, np.inf)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(MOST_STEPS):
             x, y = xy[..., 0], xy[..., 1]
             e = distort(xy, D) - target
             a, b, c = radtan_derivative(x, y, x * x + y * y, D)
@@ -164,7 +164,7 @@ def _undistort_theta(theta_d: FloatArray, D: FloatArray) -> tuple[FloatArray, Bo
     error = np.full(shape, np.inf)
     slope = np.ones(shape)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(MOST_STEPS):
             t2 = theta * theta
             value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
             slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))

@@ -25,6 +25,7 @@ POSITION = slice(3, 6)  # m, p_world_imu
 VELOCITY = slice(6, 9)  # m/s, in world
 GYRO_BIAS = slice(9, 12)  # rad/s
 ACCEL_BIAS = slice(12, 15)  # m/s^2
+BIASES = slice(9, 15)
 GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
 CORE = 17
 

@@ -17,6 +17,7 @@ from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrf, dtpqrt, dtrtrs
 from vical_daemon.estimation.measurements import FloatArray
 
 SPREAD = np.sqrt(3.0)  # matches the kurtosis of a Gaussian
+RIDGE = 1e-12  # over the diagonal of a matrix that may be singular
 _BLOCK = 16  # columns that LAPACK's QR of triangle and rows takes at once; 8 to 32 are alike
 
 

@@ -17,14 +17,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chance
 
 _LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
 _LONGEST_RUN = 4
-_RIDGE = 1e-12  # corners in one line leave a turn about it open
 
 
 class _JackknifeBlock(NamedTuple):
@@ -91,7 +90,7 @@ class BlockJackknife:
         rows = np.concatenate([by_pose, by, innovation[:, None]], axis=1)
         N, p = rows.T @ rows, by_pose.shape[1]
         posed = N[:p, :p].copy()
-        posed.ravel()[:: p + 1] += _RIDGE * posed.trace()
+        posed.ravel()[:: p + 1] += RIDGE * posed.trace()  # corners in one line leave a turn about it open
         explained = solve_lower(root(posed), N[:p, p:])
         N = N[p:, p:] - explained.T @ explained
         A, b = N[:-1, :-1], N[:-1, -1]

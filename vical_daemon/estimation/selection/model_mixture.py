@@ -20,11 +20,10 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import OFF
-from vical_daemon.estimation.model.unscented import root, solve_lower, unit
+from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
-RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as given has none
 
 Weights = dict[tuple[str, ...], float]
 """Probability of each hypothesis, named by the blocks that are as specified."""

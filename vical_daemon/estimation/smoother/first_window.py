@@ -10,6 +10,7 @@ from typing import NamedTuple
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.state import Layout
+from vical_daemon.estimation.robust import MOST_STEPS
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
@@ -20,7 +21,6 @@ from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 
-_STEPS = 30  # of the adjustment, at most
 DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
 
 
@@ -130,7 +130,7 @@ class FirstWindow:
         models, held = self._status.models, self.initializer.held
         carry = initial_prior(window, known, self._layout, held, models.imu_sigma, self._prior, reopened)
         bundle = Bundle(window, carry, noise)
-        return bundle, carry, bundle.solve(buffer, _STEPS)
+        return bundle, carry, bundle.solve(buffer, MOST_STEPS)
 
     def anew(self) -> None:
         """Estimate everything again from the config; its mounting is no longer that of the rig."""

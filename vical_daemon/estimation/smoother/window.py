@@ -30,8 +30,6 @@ KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220
 _MIN_SEEN = 4
 NEAREST_M, FARTHEST_M = 0.1, 200.0
-_HALF_S = WINDOW_START.readout_s
-"""Rates hold for so long before and after an image: exact at the first and last row of a readout of 30 ms."""
 
 IntArray = npt.NDArray[np.intp]
 
@@ -190,7 +188,8 @@ class Window:
     def measure_turning(self, buffer: ImuBuffer) -> None:
         """Take from the readings how the imu turns at each image, at the time shift of the links."""
         instants = np.array([t for t, _ in self.frames]) + self.shift_s
-        self.turning = np.array(buffer.turning(instants, _HALF_S))
+        # rates hold for half a readout of 30 ms before and after an image
+        self.turning = np.array(buffer.turning(instants, WINDOW_START.readout_s))
 
     def relink(self, buffer: ImuBuffer) -> bool:
         """Integrate again at the present time shift and biases; False where inertial data do not reach."""

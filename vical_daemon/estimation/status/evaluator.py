@@ -13,6 +13,7 @@ from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.trace import Trace
+from vical_daemon.estimation.model.unscented import RIDGE
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
@@ -21,7 +22,6 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
-from vical_daemon.estimation.selection.model_mixture import RIDGE
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
     RunningMotion,

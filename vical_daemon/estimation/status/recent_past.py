@@ -23,7 +23,7 @@ from vical_daemon.estimation.temporal.shift_step import (
     level_at,
 )
 
-_BEFORE_S = 3.0  # a change is noticed within
+BEFORE_S = 3.0  # a change is noticed within
 _STRETCHES = (10, 15, 30)  # images in which a step is looked for
 _LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
 _BEFORE_IMAGES = 30  # that show how well orientations usually fit
@@ -41,7 +41,7 @@ class RecentPast:
         """Remember an image, whether it was used, and once a second the filter."""
         frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
         frames.append((t_cam_s, frame, report.used))
-        while self._copies and self._copies[0].state.t_s < f.state.t_s - _BEFORE_S - EVERY_S:
+        while self._copies and self._copies[0].state.t_s < f.state.t_s - BEFORE_S - EVERY_S:
             self._copies.popleft()
         if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + EVERY_S:
             self._copies.append(deepcopy(f))

@@ -19,8 +19,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
 
-FALSE_ALARM = CALIBRATIONS_DISAGREE
-"""Probability that at least one of several calibrations is wrongly said to disagree, if sigmas are true."""
 LEVER_ARM, ROTATION, TIME_SHIFT, LENS = "lever arm", "rotation", "time shift", "lens"
 
 
@@ -128,17 +126,16 @@ def _quantities(
     return found
 
 
-def agreements(found: Sequence[Calibration | None], false_alarm: float = FALSE_ALARM) -> list[Agreement]:
+def agreements(found: Sequence[Calibration | None]) -> list[Agreement]:
     """Compare each calibration with those of the others that agree.
 
     Two that disagree with each other, and nothing else: both are said to disagree.
 
     Args:
         found: Independent calibrations; None: there is none.
-        false_alarm: See `FALSE_ALARM`.
     """
     known = [k for k, calibration in enumerate(found) if calibration]
-    limit = np.log(false_alarm / max(len(known), 1))
+    limit = np.log(CALIBRATIONS_DISAGREE / max(len(known), 1))
     kept = list(known)
     while len(kept) > 2:
         compared = {k: _compare(found, k, kept) for k in kept}

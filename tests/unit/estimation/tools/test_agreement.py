@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.result import CameraEstimate, PoseEstimate
-from vical_daemon.estimation.tools.agreement import FALSE_ALARM, Agreement, agreements, calibrations
+from vical_daemon.estimation.tools.agreement import CALIBRATIONS_DISAGREE, Agreement, agreements, calibrations
 
 ARM = np.array([0.1, -0.05, 0.02])
 TURN = Rotation.from_rotvec([1.0, -2.0, 0.5])
@@ -87,4 +87,4 @@ def test_chances_are_those_of_chi_square(rng) -> None:
     chances = [d.probability for _ in range(20) for d in verdicts([camera(rng), camera(rng)])[0].differences]
     assert len(chances) == 20 * 4  # lever arm, rotation, time shift, one number of the lens
     assert np.mean(np.array(chances) < 0.5) == pytest.approx(0.5, abs=0.2)
-    assert min(chances) > FALSE_ALARM
+    assert min(chances) > CALIBRATIONS_DISAGREE
