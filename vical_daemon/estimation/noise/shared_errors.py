@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import SURE
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.stamp_jitter import PERSISTENT
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
@@ -25,7 +26,6 @@ TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _EVERY = 20  # images that are added together; nothing is said before, unless a start said it
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
-_ABSENT = 1e-3  # a jitter is reported where the probability that there is none is less
 _WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
 WAYS = 3  # late, to the side, down
 
@@ -109,7 +109,7 @@ class SharedErrors:
     def _look(self) -> None:
         known = posterior(self._likelihood, JITTERS_S, SHIFTS_PX)
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
-        surely = known.absent[0] < _ABSENT and self._alike(0, self.jitter_s) < PERSISTENT
+        surely = 1.0 - known.absent[0] > SURE and self._alike(0, self.jitter_s) < PERSISTENT
         self.jitter_found_s = self.jitter_s if surely else 0.0
         wanders = self.shift_px > _WANDERS_PX and PERSISTENT < self._alike(1, self.shift_px) < math.inf
         self.wander_px = self.shift_px if wanders else 0.0
