@@ -374,6 +374,8 @@ class Calibrator:
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera)
         self.filter = before
+        for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
+            self._step(before, kept, t_cam_s)
         self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self._set_shift(before, camera, fit)
         self._lose_motion()

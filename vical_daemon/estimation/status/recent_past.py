@@ -20,6 +20,7 @@ from vical_daemon.estimation.temporal.shift_step import (
     Orientations,
     ShiftFit,
     find_shift,
+    first_after_step,
     level_at,
 )
 
@@ -77,6 +78,34 @@ class RecentPast:
         ]
         newer.sort(key=lambda x: x[0])
         return [(t, frame) for _, t, frame in newer]
+
+    def before_step(
+        self, f: CalibrationFilter, fit: ShiftFit, camera: str, buffer: ImuBuffer, target: FloatArray
+    ) -> Frames:
+        """Images that `f`, the filter from before, has not taken yet, and that are surely from before a step.
+
+        Args:
+            f: As `filter` returns it.
+            fit: Of the images after the step.
+            camera: Of which the time shift stepped.
+            buffer: Inertial readings.
+            target: Points of the target, m, shape (n, 3).
+
+        Returns:
+            Stamps, s, and points, of all cameras, oldest first.
+        """
+        newer = self.since(f)
+        own = [(t, frame) for t, frame in newer if frame.camera == camera]
+        seen, rows = _orientations(own, f, target), buffer.rows
+        if seen is None or len(rows) < 2:
+            return []
+        curve, known = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias), f.state.cameras
+        shift_s = known[camera].timeshift_s
+        at = first_after_step(curve, seen, known[camera].R_imu_cam, (shift_s, fit.timeshift_s))
+        if at is None:
+            return []
+        step_s = float(seen.t_cam_s[at]) + shift_s
+        return [(t, frame) for t, frame in newer if t + known[frame.camera].timeshift_s < step_s]
 
     def shift_of(
         self,

@@ -130,6 +130,39 @@ def find_shift(
     return ShiftFit(shift_s, float(np.sqrt(usual_level / curvature)), float(cost[-1]) > sure)
 
 
+def first_after_step(
+    curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, shifts_s: tuple[float, float]
+) -> int | None:
+    """Index of the earliest orientation that may be from after a step of the time shift.
+
+    Each place of the step has a sum of squares: those before it at the first time shift, the others at the
+    second, with the worlds aligned on either side. All places within six sigma of the best are possible.
+
+    Args:
+        curve: The gyro's, about its bias.
+        seen: The camera's orientations, in the order of their stamps.
+        R_imu_cam: The mounting, held, shape (3, 3).
+        shifts_s: Time shift before and after the step, s.
+
+    Returns:
+        None where the curve covers too few of the orientations, or not the first.
+    """
+    t_cam_s = seen.t_cam_s
+    covered = t_cam_s + max(shifts_s) < curve.span_s[1]
+    if covered.sum() < _LEAST_IMAGES or t_cam_s[0] + min(shifts_s) < curve.span_s[0]:
+        return None
+    seen = Orientations(*(x[covered] for x in seen))
+    t_cam_s = seen.t_cam_s
+    cost = np.zeros(len(t_cam_s))
+    for k in range(len(t_cam_s)):
+        for part, shift_s in ((slice(k), shifts_s[0]), (slice(k, None), shifts_s[1])):
+            if len(t_cam_s[part]):
+                one_side = Orientations(*(x[part] for x in seen))
+                cost[k] += float((_errors(curve, one_side, R_imu_cam, np.array([shift_s])) ** 2).sum())
+    level = max(float(cost.min()) / (3 * len(t_cam_s) - 6), 1.0)
+    return int(np.flatnonzero(cost <= cost.min() + SURE_SIGMAS**2 * level)[0])
+
+
 def _errors(
     curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, shifts_s: FloatArray
 ) -> FloatArray:

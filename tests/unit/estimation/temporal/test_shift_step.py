@@ -9,6 +9,7 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import (
     Orientations,
     find_shift,
+    first_after_step,
     level_at,
 )
 
@@ -82,3 +83,19 @@ def test_level_is_the_size_of_the_misfit():
     assert level_at(gyro_curve(), seen, RIG.R_imu_cam, 0.0) == pytest.approx(1.0, abs=0.4)
     doubled = seen._replace(sigma_rad=0.5 * seen.sigma_rad)
     assert level_at(gyro_curve(), doubled, RIG.R_imu_cam, 0.0) == pytest.approx(4.0, rel=0.4)
+
+
+@pytest.mark.parametrize(("step_s", "at"), [(0.02, 30), (-0.02, 45), (0.5, 10), (-0.5, 50)])
+def test_no_image_from_after_a_step_is_taken_for_one_from_before(step_s, at):
+    seen = orientations(0.0, n=60)
+    stepped = seen._replace(t_cam_s=seen.t_cam_s - step_s * (np.arange(60) >= at))
+    first = first_after_step(gyro_curve(), stepped, RIG.R_imu_cam, (0.0, step_s))
+    # 20 ms at 1 rad/s are 1.1 deg, eleven sigma: one image leaves little doubt, two of them none.
+    assert at - 3 <= first <= at
+
+
+def test_where_a_step_is_needs_images_that_the_gyro_covers():
+    seen = orientations(0.0, n=60)
+    late = seen._replace(t_cam_s=seen.t_cam_s + 4.9)
+    assert first_after_step(gyro_curve(), late, RIG.R_imu_cam, (0.0, 0.02)) is None
+    assert first_after_step(gyro_curve(), orientations(0.0, n=6), RIG.R_imu_cam, (0.0, 0.02)) is None
