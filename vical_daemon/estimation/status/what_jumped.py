@@ -32,7 +32,7 @@ to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
 
 _RARER = 20.0
 """So much more likely, in logarithms, must the lens be than a bump. In the first second after a bump of 5 to
-10 mm it explains images as well, with fewer unknowns: that alone made it 11 more likely (21 bumps)."""
+10 mm it explains images as well, with fewer unknowns: it was up to 11 more likely (ten bumps)."""
 
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
