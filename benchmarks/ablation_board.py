@@ -151,13 +151,13 @@ BOARD: dict[str, Mechanism] = {
     "step of the delay found": Mechanism(
         MOVED,
         "images that do not fit are tried with another delay, all else kept",
-        lambda: [(Calibrator, "_clock_changed", gives(False))],
+        lambda: [(Calibrator, "_part_changed", gives(False))],
         disturbances=("5 ms", "20 ms", "camera clock +0.5 s", "imu clock +0.5 s", "2 deg, 10 mm, 5 ms"),
     ),
     "likelihood of a jump": Mechanism(
         MOVED,
         "what jumped is judged by the innovations of the filter, not by orientations of single images alone",
-        lambda: [(Calibrator, "_clock_jumped", gives(False))],
+        lambda: [(Calibrator, "_part_jumped", gives(False))],
         disturbances=("5 ms", "2 deg, 10 mm, 5 ms"),
     ),
     "camera clock set": Mechanism(

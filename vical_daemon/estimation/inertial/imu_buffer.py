@@ -21,6 +21,7 @@ GAP_S = 0.05
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _LEAST_HALF_S = 1e-3
+_HALF_BLOCK_S = 2.5e-3  # of `BlockMeans`
 _USUAL = 201  # samples whose median interval is the usual one
 
 
@@ -125,9 +126,11 @@ class ImuBuffer:
         self._clipping_sigma[self._start + row] = clipping_sigma
 
     def remove(self, t_s: float) -> None:
-        """Forget the reading of an instant, s, where there is one."""
-        row = self._start + int(np.searchsorted(self.rows[:, 0], t_s))
-        if row < self._stop and self._rows[row, 0] == t_s:
+        """Forget the reading of an instant, s, or the mean that it is part of, where there is one."""
+        if not len(self):
+            return
+        row = self._start + int(np.argmin(np.abs(self.rows[:, 0] - t_s)))
+        if abs(self._rows[row, 0] - t_s) < _HALF_BLOCK_S:
             for column in (self._rows, self._clipping_sigma):
                 if column is not None:
                     column[row : self._stop - 1] = column[row + 1 : self._stop]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.inertial.block_means import BlockMeans, Mean
 from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, Six, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
@@ -32,7 +33,7 @@ class Reading(NamedTuple):
 
 
 class ImuIntake:
-    """Fills the buffer of inertial readings from one stream.
+    """Fills the buffer of inertial readings from one stream; those of fast devices with means (`BlockMeans`).
 
     A device or driver that hangs repeats its last reading bit by bit. Six noisy channels never do that by
     themselves, so such readings are left out: what remains is a gap like any other.
@@ -68,6 +69,7 @@ class ImuIntake:
         self._limits: RangeLimits[int] = RangeLimits()
         self._spikes: SpikeFilter[tuple[int, Six]] = SpikeFilter()
         self._bridges = ClippedReadings()
+        self._blocks = BlockMeans()
         self._taken = 0
         self._clipping_s: float | None = None  # when the stretch began of which the share is counted
         self._at_range = 0  # readings of it
@@ -221,15 +223,23 @@ class ImuIntake:
             kind = EventKind.IMU_REPEATED if repeats else EventKind.IMU_GAP
             self._gap = Event(kind, value=held_s - self._newest_s)
         self.between = False
-        self._add(buffer, held_s, held)
-        self.gap_end_s = buffer.newest_s
+        self._append(buffer, self._blocks.rest())
+        self.gap_end_s = self._add(buffer, held_s, held)
         self._add(buffer, t_s, reading)
         return [held, reading]
 
-    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
+    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> float:
+        """Add a reading to its block; return its time on the even axis, s."""
         self._newest_s = t_s
         even_s = self._steps.even(t_s)
-        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, reading.clipping_sigma)
+        six = (*reading.gyro_rps, *reading.specific_force_mps2)
+        self._append(buffer, self._blocks.take(even_s, six, reading.clipping_sigma))
+        return even_s
+
+    @staticmethod
+    def _append(buffer: ImuBuffer, mean: Mean | None) -> None:
+        if mean is not None:
+            buffer.append(mean.t_s, mean.six[:3], mean.six[3:], mean.clipping_sigma)
 
     def saw_image(self, ahead_s: float) -> None:
         """Learn from an image whether stamps that jumped forwards mean a gap, or a clock that was set.
