@@ -1,6 +1,7 @@
 """A camera that sees the target later than the others joins them, against the truth of both."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.init.late_camera import LateCameras
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import Status
 
@@ -115,3 +117,16 @@ def test_a_late_camera_that_numbers_a_target_differently_does_not_join(runs):
     assert list(end.cameras) == ["cam0"]
     assert "cam0 and cam1 number the points of the target differently" in end.reason
     assert largest_z(end, runs) < 4.0
+
+
+def test_what_is_kept_for_a_camera_that_saw_the_target_once_is_forgotten(runs):
+    """Else images and readings would pile up as long as the daemon runs."""
+    late = LateCameras(CalibrationOptions(), None, None)
+    f = SimpleNamespace(absent={"cam1"}, unobservable=None, state=SimpleNamespace(t_s=0.9))
+    frame = runs["cam0"].frames[0]
+    images = {name: PointsFrame(name, 0, frame.ids, frame.uv_px) for name in runs}
+    assert late.take(f, 1.0, images["cam1"])
+    assert late.oldest_s == 0.9
+    for t_s in np.arange(1.05, 12.0, 0.05):
+        assert not late.take(f, t_s, images["cam0"])
+    assert late.oldest_s == np.inf

@@ -66,6 +66,9 @@ class LateCameras:
             Whether it is of an absent camera, so that the filter cannot use it.
         """
         absent = frame.camera in f.absent
+        first_s = next((t_s for t_s, kept in self._frames if kept.camera == frame.camera), t_cam_s)
+        if t_cam_s - first_s > LONG_S:  # it did not see enough, or does not fit: from another image on
+            self.anew()
         if self._known is None and absent and f.unobservable is None:
             self._known, self._camera = deepcopy(f), frame.camera
         if self._known is not None and (not absent or frame.camera == self._camera):
@@ -84,8 +87,6 @@ class LateCameras:
         if found.half_turned:
             self._frames = self._rig.turns.from_the_other_end(self._camera, self._frames)
             found = self._join(self._known, buffer)
-        if found.filter is None and found.rolling is None and own[-1][0] - own[0][0] > LONG_S:
-            self.anew()
         return found
 
     def _join(self, known: CalibrationFilter, buffer: ImuBuffer) -> Attempt:
