@@ -355,7 +355,7 @@ class Calibrator:
             self._lose_motion()
             if f.unobservable is None:
                 self.evaluator.announce(Event(EventKind.POSE_LOST))
-        elif action in (Action.SKEW, Action.WANDER):
+        elif action in (Action.SKEW, Action.WANDER) and f.unobservable is None:
             anew = action is Action.WANDER
             once = f"wander {frame.camera}" if anew else ""
             self.evaluator.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
