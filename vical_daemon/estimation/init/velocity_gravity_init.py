@@ -160,9 +160,8 @@ def by_neighbours(buffer: ImuBuffer, t_s: FloatArray, R: FloatArray, gyro_bias: 
     if found is None:
         return R
     segment, begin = found
-    turned = products(over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin).dR[None])[
-        0
-    ]
+    steps = over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin).dR
+    turned = products(steps[None])[0]
     first = R @ np.swapaxes(turned, 1, 2)  # the attitude at the first instant, by each image
     mean = nearest_rotation(first.mean(axis=0))
     off = so3.log(first @ mean.T)

@@ -33,8 +33,6 @@ from vical_daemon.estimation.noise.variance_components import of_window
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _FAR = 0.03  # a target so much larger or smaller is another one: its prior is too narrow
-_LAST_NS = 1_000_000_000
-
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
@@ -92,20 +90,13 @@ def window_start(
     trial = window.filter(make(deepcopy(state)))
     trial.shared = {name: old if (old := trial.shared[name]).images else new for name, new in shared.items()}
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
-    if not _fits(reports) or not trial.plain().finite():
+    if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():
         return None
     out = window.filter(make(deepcopy(state)))
     out.corner_noise, out.shared, out.consistency = trial.corner_noise, trial.shared, trial.consistency
     for consistency in out.consistency.values():
         consistency.settle()
     return WindowStart(out, _size(trial.plain(), stated))
-
-
-def _fits(reports: Sequence[FrameReport]) -> bool:
-    """Whether most images were used, and most of the last second: these alone may show the rig turn."""
-    late = [r.used for r in reports if r.t_ns > reports[-1].t_ns - _LAST_NS]
-    used = [r.used for r in reports]
-    return 2 * sum(used) >= len(used) and 2 * sum(late) >= len(late)
 
 
 def _size(f: CalibrationFilter, stated: float) -> float | None:
