@@ -59,11 +59,11 @@ def exp(rotvec: FloatArray) -> FloatArray:
         Rotation matrices, shape (..., 3, 3).
     """
     v = np.asarray(rotvec, dtype=np.float64)
-    angle2 = np.einsum("...i,...i->...", v, v)
-    angle = np.sqrt(angle2 + _NO_ANGLE)
-    half_sinc = np.sin(0.5 * angle) / (0.5 * angle)
+    angle2 = np.vecdot(v, v)
+    half = 0.5 * np.sqrt(angle2 + _NO_ANGLE)
+    half_sinc = np.sin(half) / half
     gamma = 0.5 * half_sinc * half_sinc  # (1 - cos) / angle^2 without cancellation
-    return _polynomial(1.0 - gamma * angle2, np.sin(angle) / angle, gamma, v)
+    return _polynomial(1.0 - gamma * angle2, half_sinc * np.cos(half), gamma, v)
 
 
 def exp_one(rotvec: FloatArray) -> FloatArray:
@@ -101,7 +101,7 @@ def quat_from_rotvec(rotvec: FloatArray) -> FloatArray:
     The sign follows the angle: w < 0 for angles between pi and 3 pi.
     """
     v = np.asarray(rotvec, dtype=np.float64)
-    angle = np.sqrt(np.einsum("...i,...i->...", v, v))
+    angle = np.sqrt(np.vecdot(v, v))
     q = np.empty((*v.shape[:-1], 4))
     q[..., 0] = np.cos(0.5 * angle)
     q[..., 1:] = (0.5 * np.sinc(angle / (2.0 * np.pi)))[..., None] * v
@@ -117,7 +117,7 @@ def rotvec_from_quat(q: FloatArray) -> FloatArray:
     q = np.asarray(q, dtype=np.float64)
     w = q[..., 0]
     v = q[..., 1:]
-    norm = np.sqrt(np.einsum("...i,...i->...", v, v))
+    norm = np.sqrt(np.vecdot(v, v))
     half = np.arctan2(norm, np.abs(w))
     # angle / sin(angle / 2): tends to 2 / |w| where the vector part vanishes
     small = norm < 1e-150
@@ -150,7 +150,7 @@ def quat_conjugate(q: FloatArray) -> FloatArray:
 def quat_normalise(q: FloatArray) -> FloatArray:
     """Return quaternions of unit length with w >= 0, shape (..., 4)."""
     q = np.asarray(q, dtype=np.float64)
-    norm = np.sqrt(np.einsum("...i,...i->...", q, q))
+    norm = np.sqrt(np.vecdot(q, q))
     out: FloatArray = q / np.where(q[..., 0] < 0.0, -norm, norm)[..., None]
     return out
 
@@ -215,7 +215,7 @@ def right_jacobian(rotvec: FloatArray) -> FloatArray:
         Jacobians, shape (..., 3, 3); the left Jacobian is Jr(-v) = Jr(v)'.
     """
     v = np.asarray(rotvec, dtype=np.float64)
-    a2 = np.einsum("...i,...i->...", v, v)
+    a2 = np.vecdot(v, v)
     angle = np.sqrt(a2)
     half_sinc = np.sinc(angle / (2.0 * np.pi))
     sinc = np.sinc(angle / np.pi)
@@ -235,7 +235,7 @@ def right_jacobian_inverse(rotvec: FloatArray) -> FloatArray:
         Inverse Jacobians, shape (..., 3, 3).
     """
     v = np.asarray(rotvec, dtype=np.float64)
-    a2 = np.einsum("...i,...i->...", v, v)
+    a2 = np.vecdot(v, v)
     half = 0.5 * np.sqrt(a2)
     small = half < 0.5 * _SERIES_BELOW_RAD
     safe = np.where(small, 1.0, half)

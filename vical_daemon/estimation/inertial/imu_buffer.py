@@ -154,18 +154,18 @@ class ImuBuffer:
     def gap_within(self, from_s: float, to_s: float) -> bool:
         """Whether readings are missing somewhere between two instants, ends included."""
         t = self.rows[:, 0]
-        low = max(int(np.searchsorted(t, from_s, side="right")) - 1, 0)
-        span = t[low : int(np.searchsorted(t, to_s, side="left")) + 1]
+        low = max(int(t.searchsorted(from_s, side="right")) - 1, 0)
+        span = t[low : int(t.searchsorted(to_s, side="left")) + 1]
         widest_s = float((span[1:] - span[:-1]).max(initial=0.0))
         return widest_s > GAP_S and widest_s > self.usual_gap_s
 
     def cut(self, before_s: float) -> None:
         """Forget every reading before `before_s`."""
-        self._start += int(np.searchsorted(self.rows[:, 0], before_s))
+        self._start += int(self.rows[:, 0].searchsorted(before_s))
 
     def trim(self, before_s: float) -> None:
         """Forget readings older than `before_s`, but for the last one before it."""
-        index = int(np.searchsorted(self.rows[:, 0], before_s)) - 1
+        index = int(self.rows[:, 0].searchsorted(before_s)) - 1
         self._start += max(index, 0)
 
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
@@ -174,8 +174,8 @@ class ImuBuffer:
         if not len(rows) or from_s < rows[0, 0] or to_s > rows[-1, 0] or to_s < from_s:
             return None
         t = rows[:, 0]
-        low = int(np.searchsorted(t, from_s, side="right"))
-        high = int(np.searchsorted(t, to_s, side="left"))
+        low = int(t.searchsorted(from_s, side="right"))
+        high = int(t.searchsorted(to_s, side="left"))
         first, last = max(low - 1, 0), min(max(high, 1), len(rows) - 1)
         if last == first:
             only = np.repeat(rows[first][None], 2, axis=0)
@@ -190,8 +190,8 @@ class ImuBuffer:
         rise = np.concatenate([change[:1], slope[middle], change[1:]])
         times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
         gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
-        at, whole = np.arange(low - 1, high + 1) - first, np.array([0, len(times)])
-        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, ends, whole)
+        at = np.arange(low - 1, high + 1) - first
+        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, ends, np.array([0, len(times)]))
         return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], sigma)
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
@@ -208,7 +208,7 @@ class ImuBuffer:
         if len(rows) < 2 or t_s[0] < rows[0, 0] or t_s[-1] > rows[-1, 0] or (t_s[1:] < t_s[:-1]).any():
             return None
         t = rows[:, 0]
-        after, before = (np.searchsorted(t, t_s, side=side) for side in ("right", "left"))
+        after, before = (t.searchsorted(t_s, side=side) for side in ("right", "left"))
         inside = np.maximum(before[1:] - after[:-1], 0)
         first = min(max(int(after[0]) - 1, 0), len(rows) - 2)
         last = max(int(before[-1]), first + 1)
@@ -263,8 +263,8 @@ class ImuBuffer:
             Measured rate, rad/s, and its derivative, rad/s^2, shapes (m, 3).
         """
         rows = self.rows
-        first = max(int(np.searchsorted(rows[:, 0], t_s[0] - half_s)) - 2, 0)
-        rows = rows[first : int(np.searchsorted(rows[:, 0], t_s[-1] + half_s)) + 2]
+        first = max(int(rows[:, 0].searchsorted(t_s[0] - half_s)) - 2, 0)
+        rows = rows[first : int(rows[:, 0].searchsorted(t_s[-1] + half_s)) + 2]
         t = rows[:, 0]
         half = np.clip(np.minimum(t_s - t[0], t[-1] - t_s), _LEAST_HALF_S, half_s)
         turns = _Turns(rows[:, :4], _slopes(rows, 0, len(rows))[:, :3])
@@ -291,7 +291,7 @@ class _Turns:
 
     def at(self, t_s: FloatArray) -> FloatArray:
         """From the first reading to instants, rad, shape (m, 3)."""
-        k = np.clip(np.searchsorted(self._t, t_s, side="right") - 1, 0, len(self._t) - 2)
+        k = np.clip(self._t.searchsorted(t_s, side="right") - 1, 0, len(self._t) - 2)
         h = (self._t[k + 1] - self._t[k])[:, None]
         u = (t_s - self._t[k])[:, None] / h
         A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._rate[k + 1] - self._rate[k]
@@ -337,6 +337,6 @@ def _hermite(
     a, b = before[:, 1:], after[:, 1:]
     A, B = slope[k] * h, slope[k + 1] * h
     d = b - a
-    value = a + u * (A + u * (3.0 * d - 2.0 * A - B + u * (A + B - 2.0 * d)))
-    change = (A + u * (2.0 * (3.0 * d - 2.0 * A - B) + u * 3.0 * (A + B - 2.0 * d))) / h
-    return value, change
+    third = A + B - 2.0 * d
+    second = d - A - third
+    return a + u * (A + u * (second + u * third)), (A + u * (2.0 * second + (3.0 * u) * third)) / h

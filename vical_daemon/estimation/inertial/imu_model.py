@@ -18,7 +18,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
-_SHORT = 64  # rotation steps up to which one after the other is quickest
+_SHORT = 64  # rotation steps up to which doubling the number of factors is quickest
 
 
 class Motion(NamedTuple):
@@ -89,22 +89,22 @@ def strapdown(
     if turn_slope is not None and gyro_matrix is not None:
         turn_slope = turn_slope @ gyro_matrix[0].T
     dR = products(rotation_steps(omega, dt, turn_slope))
-    f_start = np.matmul(dR, force[..., None])[..., 0]
+    f_start = np.matvec(dR, force)
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
     dv, dp = np.zeros((2, *f_start.shape))
-    gained = (before + after) * (0.5 * h)
-    moved = (2.0 * before + after) * (h * h / 6.0)
-    if force_slope is not None:
+    if force_slope is None:
+        gained = (before + after) * (0.5 * h)
+        moved = (2.0 * before + after) * (h * h / 6.0)
+    else:
         # slope of R f: R (omega x f + f'); hardly depends on the bias: the first of the batch stands for all
-        slope = so3.cross(omega[0], force[0]) + (
-            force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
-        )
-        slope = np.matmul(dR[0], slope[..., None])[..., 0]
-        bend = slope[:-1] - slope[1:]
-        gained = gained + bend * (h * h / 12.0)
-        moved = h * h * (0.35 * before + 0.15 * after) + (0.05 * slope[:-1] - slope[1:] / 30.0) * (h * h * h)
-    np.cumsum(gained, axis=1, out=dv[:, 1:])
-    np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
+        slope = np.matvec(so3.hat(omega[0]), force[0])
+        slope += force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
+        slope = np.matvec(dR[0], slope)
+        first, last = slope[:-1], slope[1:]
+        gained = h * (0.5 * (before + after) + (h / 12.0) * (first - last))
+        moved = (h * h) * (0.35 * before + 0.15 * after + h * (0.05 * first - last / 30.0))
+    np.add.accumulate(gained, axis=1, out=dv[:, 1:])
+    np.add.accumulate(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.clipping_sigma)
 
 
@@ -123,12 +123,12 @@ def products(steps: FloatArray) -> FloatArray:
             np.matmul(pieces[:, step - 1], pieces[:, step], out=pieces[:, step])
         begin = products(pieces[:, -1])[:, :-1]
         dR[:, 1:] = np.swapaxes(begin[:, None] @ pieces, 1, 2).reshape(S, m * k, 3, 3)[:, :K]
-    elif S == 1:  # of two matrices, dot takes half as long as matmul
-        for at, step in enumerate(steps[0]):
-            np.dot(dR[0, at], step, out=dR[0, at + 1])
     else:
-        for at in range(K):
-            np.matmul(dR[:, at], steps[:, at], out=dR[:, at + 1])
+        dR[:, 1:] = steps
+        done = 1  # factors of each product
+        while done < K:
+            dR[:, done + 1 :] = dR[:, 1:-done] @ dR[:, done + 1 :]
+            done *= 2
     return dR
 
 
@@ -148,11 +148,10 @@ def rotation_steps(omega: FloatArray, dt: FloatArray, slope: FloatArray | None =
     w0, w1 = omega[:, :-1], omega[:, 1:]
     half = 0.5 * dt[:, None]
     # The coning term hardly depends on the bias: the first of the batch stands for all.
-    coning = so3.cross(w0[:1], w1[:1])
+    coning = np.matvec(so3.hat(w0[:1]), w1[:1])
     if slope is not None:
-        coning = coning + (slope[:-1] - slope[1:])
-    coning = coning * (dt * dt / 12.0)[:, None]
-    return so3.exp((w0 + w1) * half + coning)
+        coning += slope[:-1] - slope[1:]
+    return so3.exp(half * (w0 + w1 + coning * (half / 3.0)))
 
 
 def compose(start: Motion, relative: Strapdown, gravity: FloatArray) -> Motion:
@@ -168,8 +167,8 @@ def compose(start: Motion, relative: Strapdown, gravity: FloatArray) -> Motion:
     """
     T = relative.t_s[-1]
     p = start.p + T * start.v + (0.5 * T * T) * gravity
-    p += np.matmul(start.R, relative.dp[:, -1, :, None])[..., 0]
-    v = start.v + T * gravity + np.matmul(start.R, relative.dv[:, -1, :, None])[..., 0]
+    p += np.matvec(start.R, relative.dp[:, -1])
+    v = start.v + T * gravity + np.matvec(start.R, relative.dv[:, -1])
     return Motion(np.matmul(start.R, relative.dR[:, -1]), p, v)
 
 
@@ -195,14 +194,14 @@ class Influence(NamedTuple):
 
     def by_force(self, force: FloatArray) -> FloatArray:
         """Return the end by a force error, m/s^2 at each node, shape (n + 1, 3), in shape (9,)."""
-        return np.asarray(np.einsum("kij,kj->i", self.at[:, :, 3:6], self.weights[:, None] * force))
+        return np.asarray(self.weights @ np.matvec(self.at[:, :, 3:6], force))
 
     def noise(self, noise: ImuNoise) -> FloatArray:
         """Covariance of the end by white noise of the readings, and by those clipped, shape (9, 9)."""
         roots = np.sqrt(self.weights)[:, None] * _densities(noise)
         G = (self.at * roots[:, None, :]).transpose(1, 0, 2).reshape(9, -1)
         covariance = G @ G.T
-        covariance[_PLACE, _PLACE] -= noise.accel_density**2 * self.beyond
+        covariance[3:6, 3:6] -= (noise.accel_density**2 * self.beyond) * so3.IDENTITY
         by_clipping = self.by_clipping()
         if by_clipping is not None:
             covariance += by_clipping @ by_clipping.T
@@ -213,9 +212,6 @@ class Influence(NamedTuple):
         if self.clipping_sigma is None:
             return None
         return np.asarray(np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.clipping_sigma))
-
-
-_PLACE = np.arange(3, 6)
 
 
 def _densities(noise: ImuNoise) -> FloatArray:
@@ -248,11 +244,13 @@ def _influence_at(
     R: FloatArray, V: FloatArray, P: FloatArray, left: FloatArray, end: tuple[FloatArray, ...]
 ) -> FloatArray:
     """See `Influence.at`: by the motion at each node, the time left until the end (n, 1), and the end."""
+    by_turn = np.empty((len(R), 9, 3))  # made in the imu frame at the begin
+    by_turn[:, 0:3] = np.swapaxes(end[0], -1, -2)
+    by_turn[:, 3:6] = so3.hat(P + V * left - end[2])
+    by_turn[:, 6:9] = so3.hat(V - end[1])
     at = np.zeros((len(R), 9, 6))
-    at[:, 0:3, 0:3] = np.swapaxes(end[0], -1, -2) @ R
-    at[:, 3:6, 0:3] = so3.hat(P + V * left - end[2]) @ R
-    at[:, 6:9, 0:3] = so3.hat(V - end[1]) @ R
-    at[:, 3:6, 3:6] = R * left[..., None]
+    np.matmul(by_turn, R, out=at[:, :, 0:3])
+    np.multiply(R, left[..., None], out=at[:, 3:6, 3:6])
     at[:, 6:9, 3:6] = R
     return at
 
@@ -261,8 +259,8 @@ def _trapezoids(t: FloatArray) -> tuple[FloatArray, float]:
     """See `Influence.weights` and `Influence.beyond`."""
     dt = t[1:] - t[:-1]
     weights = np.zeros(len(t))
-    weights[1:] = 0.5 * dt
-    weights[:-1] += 0.5 * dt
+    weights[1:] = half = 0.5 * dt
+    weights[:-1] += half
     return weights, float((dt * dt) @ dt) / 6.0
 
 
@@ -299,8 +297,8 @@ def over_intervals(relative: Strapdown, begin: npt.NDArray[np.intp], *, errors: 
     from_begin = np.swapaxes(dR[first], 1, 2)
     since = (t - t[first])[:, None]
     R = from_begin @ dR
-    V = np.matmul(from_begin, (dv - dv[first])[..., None])[..., 0]
-    P = np.matmul(from_begin, (dp - dp[first] - since * dv[first])[..., None])[..., 0]
+    V = np.matvec(from_begin, dv - dv[first])
+    P = np.matvec(from_begin, dp - dp[first] - since * dv[first])
     nodes = [slice(int(a), int(b)) for a, b in zip(begin, stop, strict=True)]
     influences: list[Influence] = []
     if errors:

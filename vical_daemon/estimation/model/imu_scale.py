@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.state import LOWER, State
+from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
 ENTRIES = 15
 NUMBERS = ENTRIES + 1
@@ -52,10 +52,10 @@ def by_entries(
     Returns:
         By [bias 6, entries 15], rows as in `Influence`, shape (9, 21).
     """
-    at = (errors.weights[:, None, None] * errors.at).reshape(-1, 54)
-    both = (at.T @ readings).reshape(9, 6, 6)  # end, error of rate or force, reading
-    out, by_bias = np.empty((9, 6 + ENTRIES)), -at.sum(axis=0).reshape(9, 6)
+    weighted = errors.weights[:, None] * readings
+    both = (errors.at.reshape(-1, 54).T @ weighted).reshape(9, 6, 6)  # end, error of rate or force, reading
+    out, by_bias = np.empty((9, 6 + ENTRIES)), errors.by_bias()
     out[:, :3], out[:, 3:6] = by_bias[:, :3] @ gyro_matrix, by_bias[:, 3:] @ accel_matrix
     out[:, 6:15] = both[:, :3, :3].reshape(9, 9)
-    out[:, 15:] = both[:, 3 + LOWER[:, 0], 3 + LOWER[:, 1]]
+    out[:, 15:] = both[:, 3:, 3:].reshape(9, 9)[:, LOWER_FLAT]
     return out

@@ -52,10 +52,8 @@ def make_links(
     assert force_slope is not None
     if lag.size:
         as_read = np.concatenate([rate, force], axis=1)
-        rate, turn_slope = (np.matmul(M_g[of], x[..., None])[..., 0] for x in (rate, turn_slope))
-        force, force_slope = (
-            np.matmul(M_a[of], x[..., None])[..., 0] for x in (force + lag * force_slope, force_slope)
-        )
+        rate, turn_slope = (np.matvec(M_g[of], x) for x in (rate, turn_slope))
+        force, force_slope = (np.matvec(M_a[of], x) for x in (force + lag * force_slope, force_slope))
     zero = np.zeros((1, 3))
     even = segment._replace(gyro=rate, accel=force, gyro_slope=turn_slope, accel_slope=force_slope)
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
@@ -124,8 +122,8 @@ class PreintegratedLinks(NamedTuple):
         off = np.einsum("mij,mj->mi", self.by_imu, imu - self.imu)
         dR = self.dR @ so3.exp(off[:, :3])
         T = self.dt[:, None]
-        v_local = np.matmul(Rt, (v[1:] - v[:-1] - T * gravity)[..., None])[..., 0]
-        p_local = np.matmul(Rt, (p[1:] - p[:-1] - T * v[:-1] - 0.5 * T * T * gravity)[..., None])[..., 0]
+        v_local = np.matvec(Rt, v[1:] - v[:-1] - T * gravity)
+        p_local = np.matvec(Rt, p[1:] - p[:-1] - T * v[:-1] - 0.5 * T * T * gravity)
         turn = Rt @ R[1:]
         e_R = so3.log(np.swapaxes(dR, 1, 2) @ turn)
         e = np.concatenate([e_R, v_local - self.dv - off[:, 3:6], p_local - self.dp - off[:, 6:]], axis=1)
@@ -139,4 +137,4 @@ class PreintegratedLinks(NamedTuple):
         J[:, 6:, 3:6], J[:, 6:, 12:15] = -Rt, Rt
         J[:, 6:, 6:9] = -Rt * T[..., None]
         J[:, 3:, 18:] = -self.by_imu[:, 3:]
-        return np.matmul(self.root, e[..., None])[..., 0], self.root @ J
+        return np.matvec(self.root, e), self.root @ J

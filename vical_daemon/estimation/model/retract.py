@@ -14,6 +14,7 @@ from vical_daemon.estimation.model.state import (
     GRAVITY,
     GYRO_BIAS,
     LOWER,
+    LOWER_FLAT,
     POSITION,
     VELOCITY,
     CameraSlices,
@@ -106,7 +107,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         gyro_matrix = gyro_matrix + dx[layout.gyro_matrix].reshape(3, 3)
         accel_matrix = accel_matrix.copy()
-        accel_matrix[LOWER[:, 0], LOWER[:, 1]] += dx[layout.accel_matrix]
+        accel_matrix.ravel()[LOWER_FLAT] += dx[layout.accel_matrix]
     lag_s = state.accel_lag_s
     if layout.accel_lag is not None:
         lag_s += float(dx[layout.accel_lag])

@@ -30,6 +30,7 @@ GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
 CORE = 17
 
 LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
+LOWER_FLAT = 3 * LOWER[:, 0] + LOWER[:, 1]  # the same among its nine numbers, row by row
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +306,7 @@ def rotation_from_grp(p: FloatArray) -> FloatArray:
         Rotations, shape (..., 3, 3).
     """
     m = 0.25 * p
-    s = np.einsum("...i,...i->...", m, m)
+    s = np.vecdot(m, m)
     d = 1.0 / (1.0 + s) ** 2
     a, b = 4.0 * (1.0 - s) * d, 8.0 * d
     out: FloatArray = (b[..., None] * m)[..., :, None] * m[..., None, :]
