@@ -6,6 +6,7 @@ Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -138,14 +139,15 @@ class CalibrationFilter:
 
     def _predict_score(self, moved: Propagated, Q: FloatArray) -> None:
         if self.arm_score is not None:
-            walk = np.repeat([self.imu_noise.gyro_walk**2, self.imu_noise.accel_walk**2], 3) * moved.seconds
+            noise = self.imu_noise
+            walk = moved.seconds * np.array([noise.gyro_walk**2] * 3 + [noise.accel_walk**2] * 3)
             self.arm_score.predict(moved.slopes, Q, walk)
 
     def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
         """The motion at the end of a segment and the covariance of the noise gathered on the way."""
         d = self.layout.dynamic
         S = self.S[:d, :d]
-        sigmas = np.sqrt((S**2).sum(axis=1))
+        sigmas = np.sqrt(np.vecdot(S, S))
         straight = self._motion_straight.holds(sigmas)
         if straight:
             moved = move_by_derivatives(self.state, self.layout, S, segment)
@@ -153,7 +155,7 @@ class CalibrationFilter:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
         Q = self._noise(moved.influence)
         if not straight:
-            share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
+            share = np.sqrt(np.vecdot(moved.curved, moved.curved) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))
         return moved, Q
 
@@ -163,15 +165,13 @@ class CalibrationFilter:
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
-        n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
+        d, c = self.layout.dynamic, moved.curved.shape[1]
         A = self.S.copy()
         A[:9, :d] = moved.linear
         self._drift_shifts(A, moved.seconds)
-        walks = self._random_walk(moved.seconds)
-        noise = np.zeros((n, c + 9 + walks.shape[1]))
+        noise = self._random_walk(moved.seconds, after=c + 9)
         noise[:9, :c] = moved.curved
         noise[:9, c : c + 9] = unscented.root(Q)
-        noise[:, c + 9 :] = walks
         self.S = unscented.lower_root_grown(A, noise, d)
 
     # ------------------------------------------------------------------ update
@@ -182,11 +182,11 @@ class CalibrationFilter:
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
         keep, blur = lin.valid & self._belonging(image, innovation, lin), 1.0
-        if 2 * keep.sum() < lin.valid.sum():
+        if 2 * np.count_nonzero(keep) < np.count_nonzero(lin.valid):
             blur = blurred(image, innovation, lin)
             image = replace(image, sigma_px=blur * image.sigma_px)
             keep = lin.valid & self._belonging(image, innovation, lin)
-        if keep.sum() < LEAST_POINTS:
+        if np.count_nonzero(keep) < LEAST_POINTS:
             return self._refused(image, innovation, predicted)
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
@@ -261,7 +261,7 @@ class CalibrationFilter:
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
         name, scale = frame.camera, self.consistency[frame.camera].scale
-        sigma = self.corner_noise[name].sigmas(frame.sigma_px, len(frame.ids)) * np.sqrt(scale)
+        sigma = self.corner_noise[name].sigmas(frame.sigma_px, len(frame.ids)) * math.sqrt(scale)
         return Image(name, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, scale)
 
     @staticmethod
@@ -352,9 +352,8 @@ class CalibrationFilter:
 
     def finite(self) -> bool:
         """Whether state and covariance are finite."""
-        state = self.state
-        values = [state.v_world_imu, *(c.p_imu_cam for c in state.cameras.values())]
-        return bool(np.isfinite(self.S).all() and np.isfinite(np.concatenate(values)).all())
+        values = [self.S, self.state.v_world_imu, *(c.p_imu_cam for c in self.state.cameras.values())]
+        return math.isfinite(sum(float(x.sum()) for x in values))  # of infinite terms no sum is finite
 
     def forget(self, index: int, sigma: float) -> None:
         """Take one error as known to `sigma` only, whatever the rest says about it."""
@@ -399,13 +398,14 @@ class CalibrationFilter:
         for consistency in self.consistency.values():
             consistency.settle()
 
-    def _random_walk(self, dt: float) -> FloatArray:
-        """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
-        drift = np.flatnonzero(self.walk)
-        columns = np.zeros((self.layout.size, 6 + len(drift)))
-        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * so3.IDENTITY
-        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * so3.IDENTITY
-        columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+    def _random_walk(self, dt: float, after: int = 0) -> FloatArray:
+        """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros, (n, k)."""
+        drift = self.walk.nonzero()[0]
+        columns = np.zeros((self.layout.size, after + 6 + len(drift)))
+        noise, root_s = self.imu_noise, math.sqrt(dt)
+        columns[GYRO_BIAS, after : after + 3] = (noise.gyro_walk * root_s) * so3.IDENTITY
+        columns[ACCEL_BIAS, after + 3 : after + 6] = (noise.accel_walk * root_s) * so3.IDENTITY
+        columns[drift, after + 6 + np.arange(len(drift))] = root_s * np.sqrt(self.walk[drift])
         return columns
 
     def _drift_shifts(self, A: FloatArray, dt: float) -> None:
@@ -486,7 +486,7 @@ class CalibrationFilter:
 
     def sigmas(self) -> FloatArray:
         """Standard deviation of every error, shape (n,)."""
-        return np.asarray(np.sqrt((self.S**2).sum(axis=1)))
+        return np.asarray(np.sqrt(np.vecdot(self.S, self.S)))
 
     def covariance(self, rows: list[int]) -> FloatArray:
         """Covariance of chosen errors, shape (k, k)."""

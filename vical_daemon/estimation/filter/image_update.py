@@ -98,12 +98,12 @@ def whitened(image: Image, lin: Linear, fit: ImageFit) -> tuple[FloatArray, Floa
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    moves = lin.moves
-    var = np.einsum("ij,ij->i", lin.ways @ (moves @ moves.T), lin.ways)
+    covariance = lin.spread @ lin.spread.T + lin.shared @ lin.shared.T
+    var = np.vecdot(lin.ways @ covariance, lin.ways)
     if lin.curved.size:
-        var += np.einsum("ij,ij->i", lin.curved, lin.curved)
+        var += np.vecdot(lin.curved, lin.curved)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
-    passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
+    passed: BoolArray = np.vecdot(innovation, innovation / var) < _CORNER_GATE
     return passed
 
 
@@ -127,7 +127,7 @@ def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
     """Largest second-order standard deviation of a corner over its noise."""
     if not lin.curved.size or not keep.any():
         return 0.0
-    share = np.sqrt((lin.curved**2).sum(axis=1)).reshape(-1, 2).max(axis=1) / image.sigma_px
+    share = np.sqrt(np.vecdot(lin.curved, lin.curved)).reshape(-1, 2).max(axis=1) / image.sigma_px
     return float(share[keep].max())
 
 
@@ -175,7 +175,7 @@ def _moved(solution: FloatArray, spread: FloatArray, shared: FloatArray) -> Floa
 
 def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     """Sum of squares and number of the rows that no state moves."""
-    alone = np.einsum("ij,ij->i", rows, rows) < _ALONE
+    alone = np.vecdot(rows, rows) < _ALONE
     count = int(np.count_nonzero(alone))
     left = r[alone] if count else r[:0]
     return float(left @ left), count
@@ -185,12 +185,11 @@ def _correct(
     prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-    weight = 1.0 / np.repeat(image.sigma_px, 2)
+    weight, k = 1.0 / np.repeat(image.sigma_px, 2), lin.ways.shape[1]
     ways, r = lin.ways * weight[:, None], innovation * weight
-    k = ways.shape[1]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
-        if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
+        if float(np.vecdot(curved, curved).max(initial=0.0)) > 1e-4:
             ways = np.concatenate([ways, curved], axis=1)
     for _ in range(3):
         rows = rows_of(keep)
@@ -204,8 +203,8 @@ def _correct(
         c = unscented.correct(prior, small / noise, r_small / noise)
         moved = _moved(c.solution, spread, lin.shared)
         left = (r - ways @ moved).reshape(-1, 2)
-        bad = keep & (np.einsum("ij,ij->i", left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
-        if not bad.any() or (keep & ~bad).sum() < LEAST_POINTS:
+        bad = keep & (np.vecdot(left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
+        if not bad.any() or np.count_nonzero(keep & ~bad) < LEAST_POINTS:
             break
         keep = keep & ~bad
     return ImageFit(

@@ -99,5 +99,5 @@ class JumpScores:
         """
         A = sigma[:, None] * self.information[:, part, part] * sigma + unit(len(sigma))
         b = self.weighted[:, part] * sigma
-        explained = np.einsum("ki,ki->k", b, np.linalg.solve(A, b[..., None])[..., 0])
+        explained = np.vecdot(b, np.linalg.solve(A, b[..., None])[..., 0])
         return np.asarray(0.5 * (explained - np.linalg.slogdet(A)[1]))

@@ -151,7 +151,7 @@ def by_sigma_points(
 
 def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order about the nominal state, by differences; for rolling shutters."""
-    steps = np.diag(_STEP * np.sqrt((S**2).sum(axis=1)))
+    steps = np.diag(_STEP * np.sqrt(np.vecdot(S, S)))
     lin = by_sigma_points(state, layout, rates, image, np.zeros(len(S)), steps)
     return replace(lin, spread=lin.by_error @ S, curved=np.zeros((len(lin.ways), 0)))
 
@@ -159,7 +159,7 @@ def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: 
 def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order, about the nominal state; global shutter only."""
     uv, ways, by_error = view_derivatives(state, layout, rates, image)
-    valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
+    valid = np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1])
     if not valid.all():
         uv, ways = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], ways, 0.0)
     k = len(by_error)
@@ -204,7 +204,7 @@ def view_derivatives(
     at = len(by_error) - MODES * (layout.target_shape is not None)
     by_point = (J.reshape(-1, 3) @ (R @ cam.R_imu_cam).T).reshape(-1, 2, 3)  # moved in the world
     if layout.target_scale is not None:
-        ways[:, at - 1] = np.matmul(by_point, image.points[:, :, None]).ravel()
+        ways[:, at - 1] = np.matvec(by_point, image.points).ravel()
         by_error[at - 1, layout.target_scale] = 1.0
     if fields is not None:
         ways[:, at:] = np.matmul(by_point, fields).reshape(-1, MODES)

@@ -135,13 +135,13 @@ def project_jacobians(
     d, d_point, d_distortion = jacobians(points, D)
     focal = K[..., :2]
     uv = d * focal + K[..., 2:]
-    J_point = d_point * focal[..., None]
+    d_point *= focal[..., None]
     J_camera = np.zeros((*d.shape, 4 + D.shape[-1]))
     J_camera[..., 0, 0] = d[..., 0]
     J_camera[..., 1, 1] = d[..., 1]
     J_camera[..., 0, 2] = J_camera[..., 1, 3] = 1.0
-    J_camera[..., 4:] = d_distortion * focal[..., None]
-    return uv, J_point, J_camera
+    np.multiply(d_distortion, focal[..., None], out=J_camera[..., 4:])
+    return uv, d_point, J_camera
 
 
 def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,7 +158,7 @@ def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, Fl
         J_d[..., column] = powers
     J_d[..., 0, 2] = J_d[..., 1, 3] = xy2
     J_d[..., 1, 2], J_d[..., 0, 3] = r2 + 2.0 * yy, r2 + 2.0 * xx
-    d = xy + (J_d @ D if D.ndim == 1 else np.matmul(J_d, D[..., None])[..., 0])
+    d = xy + (J_d @ D if D.ndim == 1 else np.matvec(J_d, D))
     a, b, c = radtan_derivative(x, y, r2, D)
     J = np.empty((*d.shape, 3))
     J[..., 0, 0], J[..., 0, 1], J[..., 1, 1] = a, b, c

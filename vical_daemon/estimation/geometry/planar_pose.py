@@ -186,7 +186,7 @@ def _both_poses(H: FloatArray, views: _Views) -> tuple[FloatArray, FloatArray]:
     c = H[:, :2, 2]
     J = H[:, :2, :2] - c[:, :, None] * H[:, 2:, :2]
     ray = np.concatenate((c, np.ones((len(c), 1))), axis=1)
-    ray /= np.sqrt(np.einsum("mi,mi->m", ray, ray))[:, None]
+    ray /= np.sqrt(np.vecdot(ray, ray))[:, None]
     R_turn = _rotations_from_axis_z(ray)
     A = np.linalg.solve(R_turn[:, :2, :2] - c[:, :, None] * R_turn[:, 2:, :2], J)
     M = A / np.linalg.norm(A, 2, axis=(1, 2))[:, None, None]

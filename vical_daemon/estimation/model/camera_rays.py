@@ -43,7 +43,7 @@ def unproject(
     if model != EQUIDISTANT:
         xy, ok = _undistort_radtan(d, D)
         rays = np.concatenate((xy, np.ones_like(xy[..., :1])), axis=-1)
-        rays /= np.sqrt(np.einsum("...i,...i->...", rays, rays))[..., None]
+        rays /= np.sqrt(np.vecdot(rays, rays))[..., None]
         return rays, ok
     theta_d = np.hypot(d[..., 0], d[..., 1])
     theta, ok = _undistort_theta(theta_d, D)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower
+from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chance
 
 _LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
@@ -89,8 +89,8 @@ class BlockJackknife:
         # whatever the pose of the image may be: only what no pose explains says something about the rest
         rows = np.concatenate([by_pose, by, innovation[:, None]], axis=1)
         N, p = rows.T @ rows, by_pose.shape[1]
-        posed = N[:p, :p].copy()
-        posed.ravel()[:: p + 1] += RIDGE * posed.trace()  # corners in one line leave a turn about it open
+        posed = N[:p, :p]
+        posed = posed + (RIDGE * posed.trace()) * unit(p)  # corners in one line leave a turn about it open
         explained = solve_lower(root(posed), N[:p, p:])
         N = N[p:, p:] - explained.T @ explained
         A, b = N[:-1, :-1], N[:-1, -1]
@@ -126,7 +126,7 @@ class BlockJackknife:
         both = out[:, None] | out[None]
         left = whole - np.tensordot(both.astype(np.float64), A, axes=1)
         Q = np.linalg.inv(left[np.arange(len(runs)), np.arange(len(runs))])
-        without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
+        without = np.matvec(Q, b.sum(axis=0) - out @ b)
         # covariance of the changes were errors independent: stretches do not tell equally much
         C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
         usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * np.diag(P))

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,8 +91,8 @@ def normalised(
         L = root(weighted @ M)  # of the modes, Q L'
     except np.linalg.LinAlgError:
         return None
-    diagonal = L.diagonal()
-    if diagonal.min() < 1e-6 * diagonal.max():
+    diagonal = L.diagonal().tolist()
+    if min(diagonal) < 1e-6 * max(diagonal):
         return None
     along = np.concatenate([weighted @ ways, (weighted @ innovation.ravel())[:, None]], axis=1)
     along = solve_lower(L, along)  # Q' of ways and innovation
@@ -99,8 +100,19 @@ def normalised(
         directions, size, _ = np.linalg.svd(along[:, :-1] @ hidden)
         along = directions[:, int(np.count_nonzero(size > 1.0)) :].T @ along
     state = along[:, :-1] @ moves
-    out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
+    out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.vecdot(state, state))
     return np.minimum(np.maximum(out, -SURE_SIGMAS), SURE_SIGMAS)
+
+
+class _Innovation(NamedTuple):
+    """Of one image: its instant, s, and its innovation, normalised, shape (8,)."""
+
+    t_s: float
+    normal: FloatArray
+
+    def __deepcopy__(self, memo: object) -> _Innovation:
+        """Itself: it does not change."""
+        return self
 
 
 @dataclass(slots=True)
@@ -126,7 +138,7 @@ class Consistency:
     _short: float = 0.0  # sum of the squared innovations of images
     _long: float = 0.0  # of squared sums of the innovations over 3 s, over the number of images in them
     _sum: FloatArray = field(default_factory=lambda: np.zeros(MODES))
-    _recent: deque[tuple[float, FloatArray]] = field(default_factory=deque)
+    _recent: deque[_Innovation] = field(default_factory=deque)
 
     def settle(self) -> None:
         """A filter restarts with what was learnt: its first images are not counted."""
@@ -211,11 +223,11 @@ class Consistency:
             keep = 1.0 - 1.0 / self.memory
             self._weight, self._short, self._long = keep * self._weight, keep * self._short, keep * self._long
         self._weight += 1.0
-        self._recent.append((t_s, normal))
+        self._recent.append(_Innovation(t_s, normal))
         self._sum += normal
         most = max(1.0, _SHARE * self._weight)
-        while len(self._recent) > most or not t_s - _LASTS_S <= self._recent[0][0] <= t_s:
-            self._sum -= self._recent.popleft()[1]
+        while len(self._recent) > most or not t_s - _LASTS_S <= self._recent[0].t_s <= t_s:
+            self._sum -= self._recent.popleft().normal
         images = len(self._recent)
         self._short += float(normal @ normal)
         self._long += float(self._sum @ self._sum) / images

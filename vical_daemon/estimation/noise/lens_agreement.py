@@ -86,6 +86,6 @@ def with_next_power(by_lens: FloatArray, model: str) -> FloatArray:
         Shape (2k, n + 1).
     """
     below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[model])
-    size = np.maximum(np.einsum("ij,ij->i", below, below), 1e-30)
-    ratio = np.einsum("ij,ij->i", below, highest) / size  # each power is the one below times radius squared
+    size = np.maximum(np.vecdot(below, below), 1e-30)
+    ratio = np.vecdot(below, highest) / size  # each power is the one below times radius squared
     return np.concatenate([by_lens, (highest * ratio[:, None]).reshape(-1, 1)], axis=1)

@@ -148,7 +148,7 @@ def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:
     if where.timeshift is not None:
         ways[where.timeshift, 0] = 1.0
     if where.intrinsics is not None:
-        ways[range(where.intrinsics.start + 2, where.intrinsics.stop), [1, 2]] = 1.0
+        ways[where.intrinsics.start + 2, 1] = ways[where.intrinsics.start + 3, 2] = 1.0
     else:
         ways[ATTITUDE, 1:] = known.R_imu_cam[:, [1, 0]] / known.intrinsics[:2]
     return ways
