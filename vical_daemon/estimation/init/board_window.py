@@ -200,6 +200,9 @@ class BoardWindow:
                 damping = max(10.0 * damping, 1e-9)
                 continue
             dx = cho_solve((root, True), g, check_finite=False)
+            if float(g @ dx) < DONE and not damping:
+                self._move(dx)
+                return self._relink()
             cost = self._cost(now, images)
             before = self.state, self.offset, [n.at for n in self.nodes], self._links, self._measured
             self._move(dx)
@@ -214,8 +217,6 @@ class BoardWindow:
                 self._find_rates()
                 damping = max(10.0 * damping, 1e-9)
                 continue
-            if float(g @ dx) < DONE and not damping:
-                return self._relink()
             now, images, damping = trial, beyond, 0.1 * damping if damping > 1e-9 else 0.0
         return False
 
@@ -399,13 +400,13 @@ class BoardWindow:
         sigma = self.sigma_px[view.camera] * noise * view.relative
         left = view.residual
         for _ in range(2 if view.alike.size else 1):
-            far = (left**2).sum(axis=1) / sigma**2
+            far = np.vecdot(left, left) / sigma**2
             weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / SURE_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
             A, r = view.alike * twice[:, None], view.residual.ravel() * twice
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
             left = view.residual - (view.alike @ shared).reshape(-1, 2)
-        far = (left**2).sum(axis=1) / sigma**2
+        far = np.vecdot(left, left) / sigma**2
         # what is lost from sight costs as much as a gross outlier
         cost = np.where(view.seen, far / (1.0 + far / SURE_SIGMAS**2), SURE_SIGMAS**2)
         return Whitened(view.ways * twice[:, None], A, r, left, float(cost.sum() + shared @ shared))

@@ -233,7 +233,7 @@ class _Normal(NamedTuple):
         A -= np.tensordot(self.C, reduced, axes=((0, 1), (0, 1)))
         b = self.b + b0 - np.tensordot(reduced, self.c, axes=((0, 1), (0, 1)))
         d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
-        return d, np.matmul(inverse, (self.c - self.C @ d)[..., None])[..., 0]
+        return d, np.matvec(inverse, self.c - self.C @ d)
 
 
 def _normal(

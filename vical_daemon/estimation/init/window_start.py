@@ -88,6 +88,7 @@ def window_start(
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     trial = window.filter(make(deepcopy(state)))
+    trial.agreement = {}  # what it says of the lens is not kept
     trial.shared = {name: old if (old := trial.shared[name]).images else new for name, new in shared.items()}
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():

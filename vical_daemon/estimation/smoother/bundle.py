@@ -307,7 +307,7 @@ class Bundle:
     def _refuse(self, view: View) -> int:
         """Take observations out that do not fit, and whole landmarks of which a third does not."""
         seen, e = view.seen, self.problem.pixel_errors(view)[0]
-        out = ~view.valid | ((e**2).sum(axis=1) > _OUT**2)
+        out = ~view.valid | (np.vecdot(e, e) > _OUT**2)
         count = np.add.reduceat(np.ones(len(out)), seen.begin)
         share = np.add.reduceat(out.astype(float), seen.begin) / count
         out |= (share > 0.34)[seen.landmark]
@@ -331,7 +331,7 @@ class Bundle:
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
         inertial, jitter_s, alike = links_left(w, self.problem.noise.jitter_s, order, np.tril(root))
-        good = ok & ((e**2).sum(axis=1) <= _OUT**2)
+        good = ok & (np.vecdot(e, e) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
         return Fit(

@@ -203,7 +203,7 @@ def _conditioned(
     Bt = np.swapaxes(B, 1, 2)
     filled = np.eye(size) * (np.abs(B).sum(axis=1) == 0.0)[:, None, :]
     C = np.asarray(np.linalg.inv(Bt @ information @ B + filled), dtype=np.float64)
-    return B, C, np.asarray(np.matmul(C, (Bt @ weighted)[..., None])[..., 0], dtype=np.float64)
+    return B, C, np.asarray(np.matvec(C, Bt @ weighted), dtype=np.float64)
 
 
 def mixed(carry: MarginalPrior, weighed: Weighed, factor: float = 1.0) -> tuple[FloatArray, FloatArray]:
@@ -211,7 +211,7 @@ def mixed(carry: MarginalPrior, weighed: Weighed, factor: float = 1.0) -> tuple[
     (by, u, S), scale = _unknowns(carry), _sigmas(carry)
     information = np.asarray(np.linalg.inv(S / np.outer(scale, scale)), dtype=np.float64)
     B, C, m = _conditioned(information, information @ (u / scale), [free for _, free in weighed])
-    p, values = np.array([p for p, _ in weighed]), np.matmul(B, m[..., None])[..., 0]
+    p, values = np.array([p for p, _ in weighed]), np.matvec(B, m)
     mean = p @ values
     P = np.tensordot(p, factor * (B @ C @ np.swapaxes(B, 1, 2)), axes=1)
     P += (p[:, None] * values).T @ values - np.outer(mean, mean)

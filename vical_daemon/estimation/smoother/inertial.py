@@ -68,7 +68,7 @@ def add_links(window: Window, jitter_s: float, order: Order, H: FloatArray, g: F
     knots = window.knots()
     e, J = link_errors(window)
     JT = np.swapaxes(J, 1, 2)
-    A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
+    A, b = JT @ J, np.matvec(JT, e)
     # neighbours share an image and many links a knot: even and odd links, then the knots one by one
     for first in (0, 1):
         at = np.concatenate([order.frames[first:-1:2], order.frames[first + 1 :: 2]], axis=1)

@@ -161,7 +161,7 @@ class Problem:
     def pixel_errors(self, view: View) -> tuple[FloatArray, FloatArray]:
         """Whitened errors, shape (N, 2), 0 behind the camera; and Huber weights."""
         e = (view.uv - view.seen.uv) / self.noise.sigma_px
-        size = np.sqrt((e**2).sum(axis=1))
+        size = np.sqrt(np.vecdot(e, e))
         return e, np.where(view.valid, huber_weight(size, HUBER), 0.0)
 
     def normal(self, view: View) -> Normal:
@@ -225,7 +225,7 @@ class Problem:
         """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
         by_shift, e = self._whitened_by_shift(view)
         seen, F = view.seen, len(self.window.frames)
-        size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
+        size = np.bincount(seen.frame, np.vecdot(by_shift, by_shift), F)
         late = np.bincount(seen.frame, (by_shift * e).sum(axis=1), F)
         shown = size > 0.0
         return late[shown] / size[shown], self.noise.spread**2 / size[shown]
@@ -250,7 +250,7 @@ class Problem:
 
     def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
         """Sum of the Huber losses (e is weighted already: weight * size^2)."""
-        square = (e**2).sum(axis=1)
+        square = np.vecdot(e, e)
         inner = square
         outer = 2.0 * HUBER * np.sqrt(square / np.maximum(weight, 1e-12)) - HUBER**2
         return float(np.where(weight < 1.0, outer, inner).sum()) + 1e4 * float((weight == 0.0).sum())

@@ -146,7 +146,7 @@ class TrackStart:
         window.R = world @ self._R
         # the velocity by differences of positions would be coarse: it is carried along the links
         links = window.links
-        gained = links.dt[:, None] * gravity + np.matmul(self._R[:-1], links.dv[..., None])[..., 0]
+        gained = links.dt[:, None] * gravity + np.matvec(self._R[:-1], links.dv)
         window.v = np.cumsum(np.concatenate([z[None, SPEED], gained]), axis=0) @ world.T
         self.camera.p_imu_cam = z[ARM].copy()
         window.bias[:, 3:] = z[BIAS]
@@ -156,7 +156,7 @@ class TrackStart:
     def _solve(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> _Linear | None:
         """Iteratively reweighted least squares; None without a solution."""
         seen, q, A = self._seen, self._motion.D, self._motion.A
-        d = np.matmul(self._R[seen.frame] @ R_imu_cam, self._rays[..., None])[..., 0]
+        d = np.matvec(self._R[seen.frame] @ R_imu_cam, self._rays)
         P = np.eye(3) - d[:, :, None] * d[:, None, :]
         weight = self._ok / (2.0 * _RAY_SIGMA) ** 2
         prior, wanted = arm.information(), np.concatenate([np.zeros(6), arm.p_imu_cam, np.zeros(3)])
@@ -183,7 +183,7 @@ class TrackStart:
             away = X[seen.landmark] - q_now[seen.frame] - A_now[seen.frame] @ y
             ahead = (away * d).sum(axis=1)
             depth = np.clip(ahead, NEAREST_M, FARTHEST_M)
-            off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
+            off = np.linalg.norm(np.matvec(P, away), axis=1) / depth
             misfit = sigma_by_median(off) + 1e-6
             weight = self._ok / (_RAY_SIGMA * depth) ** 2 * geman_mcclure_weight((off / (3.0 * misfit)) ** 2)
             gravity = gravity + z[GRAVITY]

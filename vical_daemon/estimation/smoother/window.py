@@ -304,7 +304,7 @@ def place(
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     rays, ok = rays_of(seen.uv, camera)
-    d = np.matmul(R[seen.frame] @ camera.R_imu_cam, rays[..., None])[..., 0]
+    d = np.matvec(R[seen.frame] @ camera.R_imu_cam, rays)
     c = (p + R @ camera.p_imu_cam)[seen.frame]
     first = seen.begin
     anchor = c[first]

@@ -163,7 +163,7 @@ class _Fit:
         """
         with np.errstate(all="ignore"):
             _, J, J_lens = project_jacobians(rays, self.intrinsics, self.distortion, self.model)
-            (a, b), c = (np.einsum("nk,njk->jn", J[:, 0], J)), np.einsum("nk,nk->n", J[:, 1], J[:, 1])
+            (a, b), c = (np.einsum("nk,njk->jn", J[:, 0], J)), np.vecdot(J[:, 1], J[:, 1])
             inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
             out = -np.swapaxes(J, 1, 2) @ (inverse @ J_lens)
         out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
@@ -254,7 +254,7 @@ class _Fit:
         dR = np.swapaxes(A1, 1, 2) @ A2
         R12 = R.T @ dR @ R
         usable = (inside[p.first] & inside[p.second])[p.of] & self.ok
-        b = np.matmul(R12[p.of], self.b[..., None])[..., 0]
+        b = np.matvec(R12[p.of], self.b)
         n = so3.cross(self.a, b) * usable[:, None]
         M = np.add.reduceat(n[:, :, None] * n[:, None, :], p.begin)
         vectors = np.linalg.eigh(M)[1]
@@ -266,7 +266,7 @@ class _Fit:
             across = ta[:, :2] ** 2 + tb[:, :2] ** 2
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
-        back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
+        back = np.matvec(np.swapaxes(R12, 1, 2)[p.of], ta)
         local = so3.cross(self.b, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
         J = np.einsum("ni,nik->nk", local, by_turn[p.of])
@@ -276,7 +276,7 @@ class _Fit:
         Jt = np.einsum("ni,nik->nk", n, Bt)
         if self.gyro_density is not None:
             share = (usable / length)[:, None]
-            turned = np.matmul((A2 @ R)[p.of], local[..., None])[..., 0]
+            turned = np.matvec((A2 @ R)[p.of], local)
             self.effects = Effects(-tb[:, :2] * share, back[:, :2] * share, turned * share)
         return e, J * (usable / length)[:, None], Jt * (usable / length)[:, None]
 
@@ -293,7 +293,7 @@ class _Fit:
         p = self.pairs
         out = np.empty((len(dR), 3, 7))
         out[:, :, :3] = np.eye(3) - np.swapaxes(R12, 1, 2)
-        spin = rate[p.second] - np.matmul(np.swapaxes(dR, 1, 2), rate[p.first][..., None])[..., 0]
+        spin = rate[p.second] - np.matvec(np.swapaxes(dR, 1, 2), rate[p.first])
         out[:, :, 3] = spin @ R
         out[:, :, 4:] = -R.T @ np.swapaxes(A2, 1, 2) @ (area[p.second] - area[p.first])
         return out

@@ -215,7 +215,7 @@ def _update(
         start += len(s.t_s)
         x = solution.x[4 * i : 4 * i + 4]
         local = np.einsum("kji,kj->ki", s.R_world_ref.T @ s.R_world_sensor, noise[rows])
-        d2 = np.einsum("ki,ki->k", local, np.linalg.solve(s.covariance, local[..., None])[..., 0])
+        d2 = np.vecdot(local, np.linalg.solve(s.covariance, local[..., None])[..., 0])
         by_median = 0.5 * float(np.log(max(float(np.median(d2)), 1e-12) / MEDIAN_CHI2_3))
         by_median = max(by_median, s.least_log_scale)
         log_scale = by_median if rescale else s.log_scale

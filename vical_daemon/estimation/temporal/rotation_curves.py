@@ -37,7 +37,7 @@ def cumulative_product(steps: FloatArray) -> FloatArray:
     while stride < len(q):
         q[stride:] = so3.quat_multiply(q[:-stride], q[stride:])
         stride *= 2
-    q /= np.sqrt(np.einsum("ij,ij->i", q, q))[:, None]
+    q /= np.sqrt(np.vecdot(q, q))[:, None]
     return q
 
 
@@ -84,7 +84,7 @@ class GyroCurve:
         np.cumsum(0.5 * dt[:, None, None] * (R[:-1] + R[1:]), axis=0, out=integral[1:])
         # in a hole the rate is unknown: it may have differed from the straight line by its own usual size
         hole = np.where(dt > _GAP * np.median(dt), dt, 0.0)
-        extra = np.mean(np.einsum("ij,ij->i", rate, rate)) / 3.0 * hole**2
+        extra = np.mean(np.vecdot(rate, rate)) / 3.0 * hole**2
         return cls(t_s, rate, q, integral, np.concatenate(([0.0], np.cumsum(extra))))
 
     @property

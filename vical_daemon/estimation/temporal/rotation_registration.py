@@ -70,7 +70,7 @@ def closest_points(
     for _ in range(2):
         R, rate, _ = curve.at(tau)
         r = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(so3.quat_from_matrix(R)), q_target))
-        step = np.einsum("ij,ij->i", rate, r) / (np.einsum("ij,ij->i", rate, rate) + 1e-6)
+        step = np.vecdot(rate, r) / (np.vecdot(rate, rate) + 1e-6)
         tau = np.clip(tau + np.clip(step, -window_s / 6, window_s / 6), low, high)
     return np.clip(tau, times_s - window_s, times_s + window_s), rate
 
@@ -113,7 +113,7 @@ def closest_point_registration(
 
 def _shift_step(offset: FloatArray, rate: FloatArray, weight: FloatArray, window: float) -> float:
     """Robust mean of the pairs' time offsets, weighted with the squared rate; edge pairs do not count."""
-    w = weight * np.einsum("ij,ij->i", rate, rate) * (np.abs(offset) < 0.98 * window)
+    w = weight * np.vecdot(rate, rate) * (np.abs(offset) < 0.98 * window)
     if w.sum() <= 0.0:
         return 0.0
     step = 0.0

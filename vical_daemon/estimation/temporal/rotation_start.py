@@ -58,7 +58,7 @@ class Start:
 
 def angles_between(qa: FloatArray, qb: FloatArray) -> FloatArray:
     """Angles between orientations given as quaternions (..., 4), rad, shape (...,)."""
-    dot = np.abs(np.einsum("...i,...i->...", qa, qb))
+    dot = np.abs(np.vecdot(qa, qb))
     out: FloatArray = 2.0 * np.arccos(np.minimum(dot, 1.0))
     return out
 
@@ -204,7 +204,7 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
         residual = turn_imu - turn_cam @ R.T
         bias = np.sum(residual * (weight * dt)[:, None], axis=0) / np.sum(weight * dt * dt)
         residual = residual - bias * dt[:, None]
-        length2 = np.einsum("ij,ij->i", residual, residual)
+        length2 = np.vecdot(residual, residual)
         weight = geman_mcclure_weight(length2 / max(2.0 * float(np.median(length2)), 1e-12))
-    misfit = float(np.sqrt(np.median(np.einsum("ij,ij->i", residual, residual))))
+    misfit = float(np.sqrt(np.median(np.vecdot(residual, residual))))
     return _Mounting(R, bias, misfit, mirrored)
