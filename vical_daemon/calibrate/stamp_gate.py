@@ -106,8 +106,9 @@ class StampGate(Generic[T]):
         self.refused += len(chain.held)
 
     def _refuse_all(self) -> None:
-        self.refused += sum(len(chain.held) for chain in self._chains)
-        self._chains.clear()
+        if self._chains:
+            self.refused += sum(len(chain.held) for chain in self._chains)
+            self._chains.clear()
 
 
 def _near(a_ns: int, b_ns: int) -> bool:

@@ -66,11 +66,11 @@ class RunningMotion:
         self._sum, self._count = [0.0, 0.0, 0.0], 0
         self._weight = self._keep * self._weight + 1.0
         self._mean += (rate - self._mean) / self._weight
-        self._scatter += (np.outer(rate, rate) - self._scatter) / self._weight
+        self._scatter += (rate[:, None] * rate - self._scatter) / self._weight
         if self._last is not None and dt < 3.0 * _BLOCK_S:
             self._changes = self._keep * self._changes + 1.0
-            square = float(np.sum((rate - self._last) ** 2)) / dt**2
-            self._change += (square - self._change) / self._changes
+            change = (rate - self._last) / dt
+            self._change += (float(change @ change) - self._change) / self._changes
         self._last = rate
 
     def scatter(self, bias_rps: FloatArray | None = None) -> FloatArray:

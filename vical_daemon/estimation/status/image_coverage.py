@@ -17,6 +17,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
 
 _ACROSS, _DOWN = 16, 12  # parts of the picture
+_LAST, _NUMBER = np.array([_ACROSS - 1, _DOWN - 1]), np.array([1, _ACROSS])  # part, and its number: x, y
 _LEAST = 5  # corners of a part that has been seen
 _SHARE = 0.5  # of the parts along an edge
 _PARTLY = 0.75  # of the most corners in one image; fewer: targets are seen that are partly in the picture
@@ -33,8 +34,9 @@ class Cover:
         camera = f.state.cameras[report.camera]
         if not f.layout.lens_free(report.camera) or camera.distortion_model == EQUIDISTANT:
             return
-        picture = self._pictures.setdefault(report.camera, ImageCoverage(camera.resolution))
-        picture.add(report.uv_px[report.accepted])
+        if report.camera not in self._pictures:
+            self._pictures[report.camera] = ImageCoverage(camera.resolution)
+        self._pictures[report.camera].add(report.uv_px[report.accepted])
 
     def advice(self) -> Guidance:
         """What to show the cameras, the first that lacks something; nothing where none does."""
@@ -59,8 +61,9 @@ class ImageCoverage:
 
     def add(self, uv_px: FloatArray) -> None:
         """Take the corners of one image, shape (n, 2)."""
-        x, y = np.clip((uv_px / self._part_px).astype(np.int64), 0, (_ACROSS - 1, _DOWN - 1)).T
-        self._counts += np.bincount(y * _ACROSS + x, minlength=self._counts.size).reshape(_DOWN, _ACROSS)
+        part = np.maximum(np.minimum((uv_px / self._part_px).astype(np.int64), _LAST), 0)
+        places = np.bincount(part @ _NUMBER, minlength=self._counts.size)
+        self._counts += places.reshape(_DOWN, _ACROSS)
         self._most, self._least = max(self._most, len(uv_px)), min(self._least, len(uv_px))
 
     def unseen_edges(self) -> tuple[Edge, ...]:

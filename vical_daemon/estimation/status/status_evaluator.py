@@ -92,7 +92,8 @@ class StatusEvaluator(Evaluator):
 
     def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the verdict of one frame."""
-        self._points[0] += int((~report.accepted).sum())
+        accepted = int(np.count_nonzero(report.accepted))
+        self._points[0] += len(report.accepted) - accepted
         self._points[1] += len(report.accepted)
         self._recent_used.append(report.used)
         if not report.used:
@@ -100,8 +101,8 @@ class StatusEvaluator(Evaluator):
         self.frames += 1
         self._squares.append((report.nis, report.dof))
         square = self._residuals.setdefault(report.camera, deque(maxlen=400))
-        good = report.residual_px[report.accepted]
-        square.append((float((good**2).sum()), 2 * len(good)))
+        good = report.residual_px[report.accepted].ravel()
+        square.append((float(good @ good), len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
         if f.unobservable is not None:  # with guesses nothing can be said of what else may be off
