@@ -49,12 +49,17 @@ class TestDetect:
             done += bool(role.points(image(NOW + k * 50 * MS)))
         assert done == 60
 
-    def test_images_of_another_size_are_refused_until_they_stay(self, config: Config) -> None:
+    def test_images_of_another_size_are_refused_and_named(self, config: Config) -> None:
+        """A camera that came back on USB 2 at half size: its pixels are those of another lens."""
         role = DetectRole(config, "cam0", lambda picture, t_ns: None)
-        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48), (1, 1), (1, 1)] + [(64, 48)] * 3 + [(32, 24)] * 4
+        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48)] + [(32, 24)] * 6
         done = [bool(role.points(image(NOW + k * 100 * MS, size))) for k, size in enumerate(sizes)]
-        assert done == [True] * 3 + [False, True, False, False] + [True] * 3 + [False, False, True, True]
-        assert role.status().values["malformed"] == "5"
+        assert done == [True] * 3 + [False, True] + [False] * 6
+        status = role.status()
+        assert status.level is Level.ERROR and status.values["of_another_size"] == "7"
+        assert status.message == "images are 32 x 24 px, not 64 x 48 as in the config: not used"
+        assert role.points(image(NOW + 2000 * MS))
+        assert role.status().level is Level.OK
 
     def test_a_detector_that_raises_is_made_anew(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
