@@ -49,6 +49,9 @@ class DetectRole:
         camera: Name of the camera.
         detector: Finds points in one image; None: that of the config.
         prior: Prior of the camera; None: that of the config.
+
+    Attributes:
+        wrong_target: What the images contradict in the target file, one line; "": nothing is known.
     """
 
     def __init__(
@@ -65,7 +68,10 @@ class DetectRole:
         if free and config.imus:
             self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
         predictor = self.aid.predictor if self.aid else None
-        self._make: Callable[[], Detect] = lambda: detector or make_detector(config, predictor)
+        self._make: Callable[[], Detect] = lambda: (
+            detector or make_detector(config, predictor, self._on_wrong_target)
+        )
+        self.wrong_target = ""
         self._detect = self._make()
         self._size = (prior or camera_prior(config, camera)).resolution
         self._other_size: tuple[int, int] | None = None  # of the last image, if not that
@@ -129,6 +135,12 @@ class DetectRole:
             notify.event("detector_restarted", line, level="warning", camera=self.camera)
         self._detect = self._make()
 
+    def _on_wrong_target(self, text: str) -> None:
+        self.wrong_target = text
+        line = f"{self.camera}: {text}"
+        _log.warning("%s", line)
+        notify.event("wrong_target", line, level="warning", camera=self.camera)
+
     def status(self, dropped: int = 0, busy_s: float = 0.0) -> DiagnosticStatus:
         """Return the health of the detector.
 
@@ -159,6 +171,8 @@ class DetectRole:
             return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
+        if self.wrong_target:
+            level, message = Level.ERROR if share < 0.1 else Level.WARN, self.wrong_target
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
 
 

@@ -57,7 +57,8 @@ def search_tags(
             follows gets the passes over reduced pictures and one of the others in turn.
 
     Returns:
-        Tag ids counted from `target.first_tag`, shape (n,), each at most once, and the corners 0..3 of each, px, shape (n, 4, 2).
+        Tag ids counted from `target.first_tag`, shape (n,), each at most once, and the corners 0..3 of each,
+        px, shape (n, 4, 2).
     """
     tags = target.tag_cols * target.tag_rows
     found: dict[int, FloatArray] = {}

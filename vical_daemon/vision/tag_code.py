@@ -77,7 +77,8 @@ def decode(
         first: The smallest of them.
 
     Returns:
-        Tag ids counted from `first`, shape (n,), -1 where there is none, and the corners turned so that corner 0 comes first.
+        Tag ids counted from `first`, shape (n,), -1 where there is none, and the corners turned so that
+        corner 0 comes first.
     """
     if not len(quads_px):
         return np.zeros(0, np.int64), quads_px
@@ -111,7 +112,7 @@ def _centred_words() -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _turned_words(tags: int, first: int) -> FloatArray:
-    """Words as +-1 when the first quad corner is corner j of the tag, rows j * tags + id - first, (4 tags, 36)."""
+    """Words as +-1 if the first quad corner is corner j, in row j * tags + id - first, (4 * tags, 36)."""
     bits = tag_bits()[first : first + tags]
     turned = [np.rot90(bits, -j, axes=(1, 2)).reshape(tags, -1) for j in range(4)]
     return np.where(np.concatenate(turned), 1.0, -1.0)

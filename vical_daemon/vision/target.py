@@ -34,9 +34,9 @@ MAX_CHECKERBOARD_CORNERS = 200
 class AprilGrid:
     """A grid of AprilTags of the 36h11 family, as Kalibr prints it.
 
-    Tag ids run along x first, then up, from ``first_tag`` on; ``point_id = 4 * (tag_id - first_tag) + corner``,
-    corners 0..3 at (0,0), (s,0), (s,s), (0,s) from the tag's lower-left corner, s = ``tag_size_m``. Tags
-    repeat every ``tag_size_m * (1 + tag_spacing)``.
+    Tag ids run along x first, then up, from ``first_tag`` on. ``point_id = 4 * (tag_id - first_tag) +
+    corner``, corners 0..3 at (0,0), (s,0), (s,s), (0,s) from the tag's lower-left corner, s =
+    ``tag_size_m``. Tags repeat every ``tag_size_m * (1 + tag_spacing)``.
 
     Attributes:
         tag_cols: Tags along x.

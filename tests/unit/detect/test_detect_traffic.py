@@ -61,6 +61,25 @@ class TestDetect:
         assert role.points(image(NOW + 2000 * MS))
         assert role.status().level is Level.OK
 
+    def test_a_wrong_target_file_is_told_in_the_status_and_the_journal(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        events: list[tuple[str, str]] = []
+        monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append((name, text)))
+        tells: list[Any] = []
+
+        def make(_config: Config, _predictor: Any, tell: Any) -> Any:
+            tells.append(tell)
+            return lambda picture, t_ns: None
+
+        monkeypatch.setattr(detect, "make_detector", make)
+        role = DetectRole(config, "cam0")
+        role.points(image(NOW))
+        tells[0]("the tags stand in rows of 6, the target file states tagCols: 5")
+        status = role.status()
+        assert status.level is Level.ERROR and status.message.startswith("the tags stand in rows of 6")
+        assert events == [("wrong_target", f"cam0: {status.message}")]
+
     def test_a_detector_that_raises_is_made_anew(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
