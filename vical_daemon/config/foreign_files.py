@@ -25,6 +25,12 @@ _FORMATS = (  # mark at the start of a line (or JSON key), what it is, what to d
     (r"Calibration results\s*$", "Kalibr's report", "give the camchain-imucam.yaml that was written with it"),
 )
 _FOR_PRIORS = (  # read elsewhere, but not as prior values
+    (r"target_type\s*:", "a target file", "give it with --target"),
+    (
+        r"(imus|cameras)\s*:",
+        "a config of vical",
+        "prior values have sections like `cam0: {{intrinsics: [...]}}`",
+    ),
     (
         r"\s*\{?\s*\"(t_ns|cameras|estimate|note)\"\s*:",
         "a result of vical",

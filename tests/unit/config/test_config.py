@@ -277,6 +277,8 @@ class TestInitial:
             ('{"t_ns": 5, "cameras": {}}', "a result of vical; `vical export .*initial.yaml --format kalibr"),
             ("image_width: 752\ncamera_matrix:\n  rows: 3\n", "a file of ROS; .* Kalibr's form"),
             ("sensor_type: camera\nT_BS: {cols: 4}\n", "EuRoC's sensor.yaml"),
+            ("target_type: aprilgrid\ntagCols: 6\n", "a target file; give it with --target"),
+            ("rig: rover\ncameras: {cam0: {uri: x}}\n", "a config of vical; .*`cam0: {intrinsics"),
         ],
     )
     def test_files_of_other_tools_are_named(self, tmp_path: Path, text: str, says: str) -> None:
