@@ -52,6 +52,7 @@ class DetectRole:
 
     Attributes:
         wrong_target: What the images contradict in the target file, one line; "": nothing is known.
+        refused: Number of images of another size than that of the config.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class DetectRole:
         self._problem = self._why_malformed = ""
         self.rate_hz = config.calibration.detect_rate_hz  # images per second at most
         self._next_ns = 0.0
-        self._images = self._found = self._malformed = self._skipped = self._failures = self._refused = 0
+        self._images = self._found = self._malformed = self._skipped = self._failures = self.refused = 0
         self._busy_s = 0.0
 
     def points(self, sample: Sample) -> list[Message]:
@@ -93,7 +94,7 @@ class DetectRole:
         height, width = image.shape[:2]
         self._other_size = None if (width, height) == self._size else (width, height)
         if self._other_size is not None:  # another lens, to an estimator that knows pixels only
-            self._refused += 1
+            self.refused += 1
             return []
         if not self._due(stamp_ns):
             self._skipped += 1
@@ -155,7 +156,7 @@ class DetectRole:
             "skipped": str(self._skipped),
             "dropped": str(dropped),
             "malformed": str(self._malformed),
-            "of_another_size": str(self._refused),
+            "of_another_size": str(self.refused),
             "failures": str(self._failures),
             "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
         }

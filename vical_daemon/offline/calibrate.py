@@ -129,9 +129,8 @@ def run_job(
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
     wrong = "; ".join(f"{d.camera}: {d.wrong_target}" for d in player.detectors if d.wrong_target)
-    return Outcome(
-        replace(role.latest, events=player.events), traces, frames, used, checks, estimator.left_out, wrong
-    )
+    left_out = estimator.left_out | {"images_of_another_size": sum(d.refused for d in player.detectors)}
+    return Outcome(replace(role.latest, events=player.events), traces, frames, used, checks, left_out, wrong)
 
 
 class _Player:

@@ -58,7 +58,9 @@ class ImageIntake:
     to the last bit by themselves. Such images are left out: what remains is a gap like any other.
 
     A clock that is set by seconds shows in the order of arrival: stamps are suddenly far from those of the
-    inertial readings that arrive with them. They are moved back to where they usually are.
+    inertial readings that arrive with them. They are moved back to where they usually are. Images without
+    points do not count: a board that is out of view is searched for, and on a busy computer such images come
+    seconds late.
 
     Attributes:
         repeated: Images left out because they were the last one again.
@@ -88,7 +90,7 @@ class ImageIntake:
             self.repeated += 1
             return None
         t_s = t_cam_s + stream.offset_s
-        if not self._in_step(stream, frame.camera, t_s - newest_imu_s, newest_imu_s):
+        if not self._in_step(stream, frame, t_s - newest_imu_s, newest_imu_s):
             return None
         t_s = t_cam_s + stream.offset_s
         self._measure(stream, frame, t_s)
@@ -98,13 +100,16 @@ class ImageIntake:
         """By how much more the last image was ahead of the newest inertial reading than usual, s."""
         return self._streams[camera].off_s if camera in self._streams else 0.0
 
-    def _in_step(self, stream: _Stream, camera: str, lead_s: float, newest_imu_s: float) -> bool:
+    def _in_step(self, stream: _Stream, frame: PointsFrame, lead_s: float, newest_imu_s: float) -> bool:
         """Whether a stamp is about where it usually is; a clock that has been set is followed."""
         heard, stream.heard_s = newest_imu_s > stream.heard_s, newest_imu_s
         off_s = stream.off_s = lead_s - stream.lead_s
         stream.images += 1
         if off_s > 0.0 and stream.images < _SETTLED:  # the first ones came late, held back until believed
             stream.lead_s, off_s = lead_s, 0.0
+        if not len(frame.ids):
+            late = off_s < 0.0 and lead_s + newest_imu_s > stream.newest_s
+            return late or abs(off_s) <= SEARCHED_S
         if abs(off_s) <= SEARCHED_S:
             stream.lead_s += _FOLLOW * off_s if heard else 0.0
             stream.stepped_s.clear()
@@ -121,7 +126,7 @@ class ImageIntake:
         stream.stepped_s.clear()
         stream.offset_s -= step_s
         stream.newest_s = np.nan
-        self._news.append(Event(EventKind.STAMPS_STEPPED, camera, step_s))
+        self._news.append(Event(EventKind.STAMPS_STEPPED, frame.camera, step_s))
         return True
 
     def _measure(self, stream: _Stream, frame: PointsFrame, t_s: float) -> None:

@@ -74,6 +74,29 @@ def test_a_camera_clock_that_is_set_is_followed_by_the_order_of_arrival(step_s):
     assert intake.offset_s("cam0") == pytest.approx(-step_s)
 
 
+def test_images_that_are_late_because_no_board_is_found_are_no_step_of_the_clock():
+    """Without a board each image is searched at length: seen live, four 'steps' of -1.8 to +2.7 s in 30 s."""
+    t = 0.08 * np.arange(400)
+    late = np.where((t > 5.0) & (t < 25.0), np.minimum(0.2 * (t - 5.0), 2.5), 0.0)
+    empty = PointsFrame("cam0", 0, np.zeros(0, np.int64), np.zeros((0, 2)))
+    frames = [empty if late_s else image() for late_s in late]
+    intake = ImageIntake()
+    taken = feed(intake, t, t + 0.02 + late, frames)
+    assert intake.news() == [] and intake.offset_s("cam0") == 0.0
+    assert taken == list(t)
+
+
+def test_a_clock_that_is_set_while_no_board_is_in_view_is_followed_when_it_is_back():
+    t = 0.05 * np.arange(200)
+    empty = PointsFrame("cam0", 0, np.zeros(0, np.int64), np.zeros((0, 2)))
+    frames = [empty if 60 <= k < 100 else image() for k in range(200)]
+    intake = ImageIntake()
+    taken = feed(intake, np.where(t < 4.0, t, t - 3600.0), t + 0.02, frames)
+    assert sum(x is None for x in taken) == 20 + 4
+    assert intake.offset_s("cam0") == pytest.approx(3600.0)
+    assert next(e.kind for e in intake.news()) == "stamps_stepped"
+
+
 def test_an_imu_that_pauses_is_no_step_of_the_camera():
     t = 0.05 * np.arange(400)
     newest = np.where((t > 5.0) & (t < 15.0), 5.0, t)
