@@ -17,7 +17,7 @@ def test_progress_is_what_is_done_not_that_somebody_speaks() -> None:
 
 
 def test_an_image_that_waits_while_no_other_comes_is_no_lack_of_progress() -> None:
-    """A USB hub was gone for 15 s: the last image has no inertial data, and the calibration was thrown away."""
+    """A USB hub was gone for 15 s: the last image has no inertial data, and the estimator started again."""
     progress = Progress()
     progress.look(100, 98, 0.0)
     for k in range(1, 300):
