@@ -172,6 +172,9 @@ class DetectRole:
             return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
+        if self._images > 50 and dropped > 0.1 * (self._images + dropped):
+            level, ms = Level.WARN, 1e3 * self._busy_s / self._images
+            message += f"; {dropped} were dropped: this computer is too slow for them ({ms:.0f} ms an image)"
         if self.wrong_target:
             level, message = Level.ERROR if share < 0.1 else Level.WARN, self.wrong_target
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)

@@ -80,6 +80,15 @@ class TestDetect:
         assert status.level is Level.ERROR and status.message.startswith("the tags stand in rows of 6")
         assert events == [("wrong_target", f"cam0: {status.message}")]
 
+    def test_a_computer_that_is_too_slow_is_named(self, config: Config) -> None:
+        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
+        for k in range(60):
+            role.points(image(NOW + k * 100 * MS))
+        assert "dropped:" not in role.status(dropped=3).message
+        status = role.status(dropped=70)
+        assert status.level is Level.WARN
+        assert "; 70 were dropped: this computer is too slow for them (" in status.message
+
     def test_a_detector_that_raises_is_made_anew(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
