@@ -91,7 +91,8 @@ def _draw_tags(target: GridOfTags) -> BoardArt:
     rectangles: list[tuple[float, float, float, float]] = []
     for row in range(target.tag_rows):
         for col in range(target.tag_cols):
-            rectangles += _draw_tag(row * target.tag_cols + col, col * pitch, row * pitch, size)
+            tag_id = getattr(target, "first_tag", 0) + row * target.tag_cols + col
+            rectangles += _draw_tag(tag_id, col * pitch, row * pitch, size)
     for row in range(target.tag_rows + 1):
         for col in range(target.tag_cols + 1):
             x, y = col * pitch - gap, row * pitch - gap

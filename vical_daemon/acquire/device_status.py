@@ -9,6 +9,8 @@ from vical_daemon.bus.messages import DiagnosticStatus, Level
 
 STUCK_S = 5.0
 """A device loop that has not turned for this long, s, is stuck: STALE, and systemd restarts the process."""
+_BEGINNING = {"opening": "is being opened", "silent": "open, no data yet"}
+"""States without a problem so far, in words."""
 
 
 def device_status(
@@ -56,7 +58,9 @@ def _level(
     if health.state == "ended":
         return Level.WARN, health.problem
     if health.state != "streaming":
-        return Level.ERROR, health.problem or health.state
+        first = health.openings <= 1 and not health.problem  # opened again, it has been silent for long
+        text = health.problem or _BEGINNING.get(health.state, health.state)
+        return Level.WARN if first and health.state in _BEGINNING else Level.ERROR, text
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
     if queue.dropped:

@@ -88,6 +88,12 @@ def calibration_in_use(config: Config, persistence: CalibrationPersistence, now_
             raise NothingInUseError(
                 f"verify.against: {path} has no lens; give cameras.{name}.lens.intrinsics"
             )
+        made_for, size = known[name].resolution, config.cameras[name].size
+        if known[name].lens is not None and made_for is not None and made_for != size:
+            before, now = ("{} x {}".format(*one) for one in (made_for, size))
+            raise NothingInUseError(
+                f"verify.against: {path} is for images of {before} px, not {now}: `vical command calibrate`"
+            )
     known = {name: known[name] for name in names}
     return InUse(path.name, known, _readouts_s(rig, names), _estimate(config, known, now_ns))
 

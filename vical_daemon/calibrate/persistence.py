@@ -63,6 +63,7 @@ class CalibrationPersistence:
         self._before: dict[str, StoredCalibration] = {}
         self._compared: set[str] = set()
         self._saved_s = -float("inf")
+        self.problem = ""  # why the last result could not be stored
         self._status: Status | None = None
         self._announced: list[Event] = []
         pattern = topics.STATUS.pattern
@@ -181,13 +182,16 @@ class CalibrationPersistence:
         if estimate is None or estimate.status is not Status.CONVERGED or self._serials.in_doubt:
             return
         self._saved_s = time.monotonic()
+        before, self.problem = self.problem, ""
         for name in estimate.cameras:
             imu, camera = self._pair(name)
             if imu and camera:
                 try:
                     self._store.save(imu, camera, name, estimate, self._clock.now_ns())
                 except StoreError as error:
-                    _log.warning("%s", error)
+                    self.problem = str(error)
+        if self.problem and self.problem != before:
+            _log.warning("%s", self.problem)
 
     def accept(self, estimate: CalibrationEstimate | None) -> bool:
         """Store an estimate because a person said so, even if it has not converged; announce the outcome.
@@ -212,7 +216,7 @@ class CalibrationPersistence:
             stored = self._load(name)
             if stored is not None:
                 self._before[name] = stored
-        self._saved_s = time.monotonic()
+        self._saved_s, self.problem = time.monotonic(), ""
         self.announce(Event(EventKind.OTHER, said="accepted: stored as the calibration of these devices"))
         return True
 

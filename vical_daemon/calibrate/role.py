@@ -194,6 +194,11 @@ class _Supervisor:
         if wait_s > 0.0:
             text = f"the estimator failed {self._restarts.count} times, starts again in {wait_s:.0f} s: "
             first = replace(first, level=Level.ERROR, message=text + self._restarts.why)
+        elif self._persistence.problem:
+            level = max(first.level, Level.WARN)
+            first = replace(
+                first, level=level, message=f"{first.message}; not stored: {self._persistence.problem}"
+            )
         return [replace(first, values=values), *others]
 
 

@@ -190,7 +190,7 @@ def conclude(
         from vical_daemon.offline.calibration_job import suspects
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
-        mistake = diagnose_input(job)
+        mistake = outcome.wrong_target or diagnose_input(job)
         why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")

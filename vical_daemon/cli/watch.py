@@ -93,6 +93,7 @@ class View:
         self.estimates: dict[tuple[str, str], CalibrationEstimate] = {}
         self._heard_s: dict[tuple[str, str], float] = {}
         self.health: dict[tuple[str, str], tuple[str, str]] = {}
+        self._printed: dict[tuple[str, str], str] = {}  # level of each component, as last printed
         self.verified: dict[tuple[str, str], VerifyResult] = {}
         self._unprinted: deque[tuple[str, str, CalibrationEstimate]] = deque(maxlen=10_000)
 
@@ -146,9 +147,10 @@ class View:
         return ", ".join(each) or "nothing is calibrating here; is `vical run` (vical.target) up?"
 
     def print_all(self) -> None:
-        """Print the last estimate of each camera."""
+        """Print the last estimate of each camera, and what does not work."""
         for (rig, camera), estimate in sorted(self.estimates.items()):
             self._print(rig, camera, estimate)
+        self._print_problems()
 
     def print_new(self) -> None:
         """Print what came since the last call (here, not in the bus' thread: a pipe may be closed)."""
@@ -156,6 +158,23 @@ class View:
             entry = self._unprinted.popleft()
             if self._json or not sys.stdout.isatty():
                 self._print(*entry)
+        if not sys.stdout.isatty():
+            self._print_problems()
+
+    def problems(self, rig: str = "") -> list[dict[str, str]]:
+        """Return the components that do not work as they should, of one rig or of all."""
+        return [
+            {"rig": of, "component": name, "level": level, "message": message}
+            for (of, name), (level, message) in sorted(self.health.items())
+            if level != "ok" and rig in ("", of)
+        ]
+
+    def _print_problems(self) -> None:
+        """Print each component whose level has changed (JSON has them in every line)."""
+        for key, (level, message) in sorted(self.health.items()):
+            before, self._printed[key] = self._printed.get(key, "ok"), level
+            if level != before and not self._json:
+                print(f"{key[0]}  {key[1]}  {level}: {message}", flush=True)
 
     def _on_estimate(self, rig: str, camera: str, sample: Sample) -> None:
         from vical_daemon.bus.messages import MessageError, decode_calibration
@@ -171,7 +190,8 @@ class View:
     def _print(self, rig: str, camera: str, estimate: CalibrationEstimate) -> None:
         verified = self.verified.get((rig, camera))
         if self._json:
-            more = {} if verified is None else {"verify": asdict(verified)}
+            more: dict[str, Any] = {} if verified is None else {"verify": asdict(verified)}
+            more["problems"] = self.problems(rig)
             print(json.dumps({"rig": rig, "camera": camera} | estimate.to_json() | more), flush=True)
         else:
             from vical_daemon.cli.live_table import one_line

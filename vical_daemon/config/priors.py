@@ -1,13 +1,16 @@
 """Priors of the estimator, from the config or from Kalibr's files.
 
 Kalibr's camchain.yaml (`cam0: intrinsics, T_cam_imu, timeshift_cam_imu, ...`) and imu.yaml keys, at the top
-level or under `imu0`, and OpenVINS's variants of both; every key is optional.
+level or under `imu0`, and OpenVINS's variants of both; every key is optional. A camera with `T_cn_cnm1` alone
+is placed by the camera before it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,8 +18,9 @@ import numpy as np
 
 from vical_daemon.config import validation as schema
 from vical_daemon.config.cross_checks import coefficients_error, rigid_error
+from vical_daemon.config.foreign_files import foreign_file
 from vical_daemon.config.model import Config, Focal, LensConfig, Matrix4, Sigma
-from vical_daemon.config.strict_yaml import ConfigError, Document, Value, read
+from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, Document, Value, read
 from vical_daemon.config.validation import Bound
 from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.measurements import (
@@ -96,8 +100,22 @@ def read_initial(path: Path | str) -> Initial:
     Raises:
         ConfigError: It cannot be used; one line.
     """
-    document = read(Path(path))
+    try:
+        return priors_in(read(Path(path)))
+    except ConfigError as error:
+        if text := foreign_file(Path(path), MAX_BYTES, as_prior=True):
+            raise ConfigError(text) from None
+        raise error
+
+
+def priors_in(document: Document) -> Initial:
+    """Return the priors of a parsed camchain, imu.yaml, or both in one document.
+
+    Raises:
+        ConfigError: It cannot be used; one line.
+    """
     cameras: dict[str, CameraPrior] = {}
+    steps: dict[str, Matrix4] = {}
     imu: _KalibrImu | None = None
     sections = [document.root, *(value for value in document.root.values() if isinstance(value, dict))]
     for section in sections:
@@ -114,13 +132,15 @@ def read_initial(path: Path | str) -> Initial:
         if name.startswith("cam"):
             camera = schema.build(document, _KalibrCamera, name)
             cameras[name] = _camera_prior(document, name, camera)
+            if camera.T_cn_cnm1:
+                steps[name] = camera.T_cn_cnm1
         elif name.startswith("imu"):
             imu = imu or schema.build(document, _KalibrImu, name)
         else:
             raise ConfigError(
                 f"{name}: unknown section; expected cam0, cam1 ... or imu0 ({document.where(name)})"
             )
-    return Initial(cameras, *(_noise(imu) if imu is not None else (None, None)))
+    return Initial(_along_the_chain(cameras, steps), *(_noise(imu) if imu is not None else (None, None)))
 
 
 def camera_prior(config: Config, name: str) -> CameraPrior:
@@ -170,7 +190,8 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         raise ConfigError(schema.mistake(document, f"{name}.distortion_coeffs", text))
     if camera.distortion_sigma is not None and (text := coefficients_error(model, camera.distortion_sigma)):
         raise ConfigError(schema.mistake(document, f"{name}.distortion_sigma", text))
-    for key, matrix in (("T_cam_imu", camera.T_cam_imu), ("T_imu_cam", camera.T_imu_cam)):
+    for key in ("T_cam_imu", "T_imu_cam", "T_cn_cnm1"):
+        matrix: Matrix4 | None = getattr(camera, key)
         if matrix is not None and (text := rigid_error(matrix)):
             raise ConfigError(schema.mistake(document, f"{name}.{key}", text))
     if camera.T_cam_imu and camera.T_imu_cam:
@@ -190,6 +211,24 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         intrinsics_sigma=camera.intrinsics_sigma,
         distortion_sigma=camera.distortion_sigma,
     )
+
+
+def _along_the_chain(cameras: dict[str, CameraPrior], steps: Mapping[str, Matrix4]) -> dict[str, CameraPrior]:
+    """Place cameras without a pose of their own: T_imu_cn = T_imu_cnm1 T_cn_cnm1^-1, cam9 before cam10."""
+    before: CameraPrior | None = None
+    for name in sorted(cameras, key=_number_in):
+        step = _inverse(steps.get(name))
+        if cameras[name].T_imu_cam is None and before is not None and before.T_imu_cam and step:
+            (R_imu_before, p_imu_before), (R_before_cam, p_before_cam) = before.T_imu_cam, step
+            pose = R_imu_before @ R_before_cam, p_imu_before + R_imu_before @ p_before_cam
+            cameras[name] = replace(cameras[name], T_imu_cam=pose)
+        before = cameras[name]
+    return cameras
+
+
+def _number_in(name: str) -> tuple[int, str]:
+    digits = re.search(r"\d+", name)
+    return (int(digits[0]) if digits else -1), name
 
 
 def _noise(imu: _KalibrImu) -> tuple[ImuNoise, float | None]:

@@ -34,12 +34,13 @@ class Found(Protocol):
         ...
 
 
-def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Detect:
+def make_detector(config: Config, predictor: FlowPredictor | None, tell: Callable[[str], None]) -> Detect:
     """Make the detector of one camera; it may keep the last image.
 
     Args:
         config: The rig.
         predictor: Predicts the flow of natural features; not used with a board.
+        tell: Called with what images contradict in the target file, one line.
 
     Raises:
         ConfigError: The target file is missing or wrong.
@@ -50,6 +51,8 @@ def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Det
         return FeatureTracker(predictor=predictor).detect
     from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
+    from vical_daemon.vision.target_check import TargetCheck
 
     assert config.target_path is not None  # checked by `config.load`
-    return BoardDetector(load_target(config.target_path)).detect
+    target = load_target(config.target_path)
+    return BoardDetector(target, check=TargetCheck(target, tell)).detect

@@ -38,7 +38,6 @@ STUCK_S = 20.0
 """A detector that works on one image for this long, s, is stuck. A detection takes 0.1 s; on a slow card
 loading OpenCV takes some seconds."""
 _SET_BACK_NS = 2e9  # longer than any queue delays an image
-_NEW_SIZE = 3  # images in a row that confirm another size
 _log = logging.getLogger(__name__)
 
 
@@ -50,6 +49,10 @@ class DetectRole:
         camera: Name of the camera.
         detector: Finds points in one image; None: that of the config.
         prior: Prior of the camera; None: that of the config.
+
+    Attributes:
+        wrong_target: What the images contradict in the target file, one line; "": nothing is known.
+        refused: Number of images of another size than that of the config.
     """
 
     def __init__(
@@ -66,14 +69,17 @@ class DetectRole:
         if free and config.imus:
             self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
         predictor = self.aid.predictor if self.aid else None
-        self._make: Callable[[], Detect] = lambda: detector or make_detector(config, predictor)
+        self._make: Callable[[], Detect] = lambda: (
+            detector or make_detector(config, predictor, self._on_wrong_target)
+        )
+        self.wrong_target = ""
         self._detect = self._make()
-        self._size: tuple[int, int] | None = None  # of the images of this camera: height, width
-        self._other: tuple[tuple[int, int], int] = ((0, 0), 0)  # another size, and how often in a row
+        self._size = (prior or camera_prior(config, camera)).resolution
+        self._other_size: tuple[int, int] | None = None  # of the last image, if not that
         self._problem = self._why_malformed = ""
         self.rate_hz = config.calibration.detect_rate_hz  # images per second at most
         self._next_ns = 0.0
-        self._images = self._found = self._malformed = self._skipped = self._failures = 0
+        self._images = self._found = self._malformed = self._skipped = self._failures = self.refused = 0
         self._busy_s = 0.0
 
     def points(self, sample: Sample) -> list[Message]:
@@ -85,8 +91,10 @@ class DetectRole:
             self._malformed += 1
             self._why_malformed = str(error)
             return []
-        if not self._of_usual_size(image.shape[:2]):
-            self._malformed += 1
+        height, width = image.shape[:2]
+        self._other_size = None if (width, height) == self._size else (width, height)
+        if self._other_size is not None:  # another lens, to an estimator that knows pixels only
+            self.refused += 1
             return []
         if not self._due(stamp_ns):
             self._skipped += 1
@@ -99,7 +107,6 @@ class DetectRole:
         except Exception as error:  # OpenCV raises on unusual images
             self._failed(error)
             return []
-        height, width = image.shape[:2]
         points: tuple[Any, Any, Any] = (_NO_IDS, _NO_POINTS, None)
         if found is not None:
             self._found += 1
@@ -107,17 +114,6 @@ class DetectRole:
         payload = encode_points(stamp_ns, self.camera, *points, (width, height))
         self._busy_s += time.perf_counter() - begin_s
         return [(self.key, payload)]
-
-    def _of_usual_size(self, size: tuple[int, int]) -> bool:
-        """Whether an image has the usual size; a new size is accepted after a few images."""
-        if self._size is None or size == self._size:
-            self._size, self._other = size, ((0, 0), 0)
-            return True
-        self._other = (size, self._other[1] + 1 if size == self._other[0] else 1)
-        if self._other[1] < _NEW_SIZE:
-            return False
-        self._size = size
-        return True
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether `rate_hz` allows an image so soon after the last one."""
@@ -140,6 +136,12 @@ class DetectRole:
             notify.event("detector_restarted", line, level="warning", camera=self.camera)
         self._detect = self._make()
 
+    def _on_wrong_target(self, text: str) -> None:
+        self.wrong_target = text
+        line = f"{self.camera}: {text}"
+        _log.warning("%s", line)
+        notify.event("wrong_target", line, level="warning", camera=self.camera)
+
     def status(self, dropped: int = 0, busy_s: float = 0.0) -> DiagnosticStatus:
         """Return the health of the detector.
 
@@ -154,17 +156,27 @@ class DetectRole:
             "skipped": str(self._skipped),
             "dropped": str(dropped),
             "malformed": str(self._malformed),
+            "of_another_size": str(self.refused),
             "failures": str(self._failures),
             "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
         }
         if busy_s > STUCK_S:
             text = f"stuck: at one image for {busy_s:.0f} s"
             return DiagnosticStatus(Level.STALE, f"detect/{self.camera}", text, "", values)
+        if self._other_size is not None:
+            found, size = ("{} x {}".format(*one) for one in (self._other_size, self._size))
+            text = f"images are {found} px, not {size} as in the config: not used"
+            return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         if self._malformed and not self._images:
             text = f"none of {self._malformed} images can be read: {self._why_malformed}"
             return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
+        if self._images > 50 and dropped > 0.1 * (self._images + dropped):
+            level, ms = Level.WARN, 1e3 * self._busy_s / self._images
+            message += f"; {dropped} were dropped: this computer is too slow for them ({ms:.0f} ms an image)"
+        if self.wrong_target:
+            level, message = Level.ERROR if share < 0.1 else Level.WARN, self.wrong_target
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
 
 

@@ -23,6 +23,7 @@ from vical_daemon.offline.accel_shift import STRAIGHT_S
 from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
 
 if TYPE_CHECKING:
+    from vical_daemon.detect.role import DetectRole
     from vical_daemon.estimation.model.frame_report import FrameReport
     from vical_daemon.estimation.smoother.bundle import Fit
     from vical_daemon.estimation.smoother.window import Window
@@ -73,6 +74,7 @@ class Outcome:
         inputs: What became of each recording, where there are several.
         held_out: How well the IMU alone predicted images before they were used, see `HeldOutCheck`.
         left_out: Readings and images that were not used, by cause, see `Estimator.left_out`.
+        wrong_target: What the images contradict in the target file, one line; "": nothing is known.
     """
 
     estimate: CalibrationEstimate
@@ -81,6 +83,7 @@ class Outcome:
     inputs: list[InputUse] = field(default_factory=list)
     held_out: list[dict[str, float]] = field(default_factory=list)
     left_out: dict[str, int] = field(default_factory=dict)
+    wrong_target: str = ""
 
 
 def run_job(
@@ -125,9 +128,9 @@ def run_job(
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
-    return Outcome(
-        replace(role.latest, events=player.events), traces, frames, used, checks, estimator.left_out
-    )
+    wrong = "; ".join(f"{d.camera}: {d.wrong_target}" for d in player.detectors if d.wrong_target)
+    left_out = estimator.left_out | {"images_of_another_size": sum(d.refused for d in player.detectors)}
+    return Outcome(replace(role.latest, events=player.events), traces, frames, used, checks, left_out, wrong)
 
 
 class _Player:
@@ -168,7 +171,7 @@ class _Player:
         status_key = topics.STATUS.key(job.config.rig, "imu")
         for key in (job.imu.key, status_key, *(points_key(job, name) for name in job.cameras)):
             self._bus.subscribe(key, self.role.take)
-        _attach_detectors(self._bus, job)
+        self.detectors = _attach_detectors(self._bus, job)
 
     def _inspect(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         self.events.extend(self._in_all(event) for event in estimate.events)
@@ -316,7 +319,7 @@ def images_at(job: Job, camera: str, stamps_ns: Sequence[int]) -> dict[int, byte
     return found
 
 
-def _attach_detectors(bus: LocalBus, job: Job) -> None:
+def _attach_detectors(bus: LocalBus, job: Job) -> list[DetectRole]:
     """Give a detector to each camera that comes as images; its points go back on the same bus."""
     images: dict[str, set[str]] = {}
     for part in job.parts:
@@ -324,15 +327,18 @@ def _attach_detectors(bus: LocalBus, job: Job) -> None:
             if stream.kind in ("image", "compressed"):
                 images.setdefault(name, set()).add(input_key(job, name, stream))
     if not images:
-        return
+        return []
     from vical_daemon.detect.role import DetectRole, attach_aid
 
+    detectors = []
     for name, keys in images.items():
         detect = DetectRole(job.config, name, prior=job.priors[name])
         attach_aid(bus, detect)
+        detectors.append(detect)
 
         def on_image(sample: Sample, detect: DetectRole = detect) -> None:
             publish(bus, detect.points(sample))
 
         for key in keys:
             bus.subscribe(key, on_image)
+    return detectors

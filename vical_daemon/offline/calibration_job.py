@@ -208,7 +208,7 @@ def _prior(name: str, stream: Stream, prior: CameraPrior | None, fix: Sequence[s
         prior = replace(prior, resolution=stream.resolution)
     elif stream.resolution is not None and stream.resolution != prior.resolution:
         given_size, size = ("{} x {}".format(*r) for r in (prior.resolution, stream.resolution))
-        raise InputError(f"{name}: --initial is for images of {given_size}, the recording's are {size}")
+        raise InputError(f"{name}: the given lens is for images of {given_size}, the recording's are {size}")
     given = {
         "intrinsics": prior.intrinsics,
         "extrinsics": prior.T_imu_cam,

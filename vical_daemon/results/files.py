@@ -8,6 +8,7 @@ from typing import Any
 
 from vical_drivers.user_files import read_text
 
+from vical_daemon.config.foreign_files import foreign_file
 from vical_daemon.config.priors import read_initial
 from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError
 from vical_daemon.results.export import ExportError, Rig, rig_from_json
@@ -16,6 +17,10 @@ from vical_daemon.results.export.kalibr import read_camchain
 from vical_daemon.results.known import KnownCamera, known_cameras, known_prior
 
 _RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
+_EXPECTED = (
+    "not a calibration that vical reads: give a result of `vical calibrate -o`, Kalibr's camchain, "
+    "OpenVINS's estimator_config.yaml, or a .yaml with messages of ROS"
+)
 
 
 def read_rig(path: Path) -> Rig:
@@ -26,6 +31,13 @@ def read_rig(path: Path) -> Rig:
     """
     if not path.exists():
         raise ExportError(f"{path}: no such file")
+    try:
+        return _read_rig(path)
+    except ExportError as error:
+        raise ExportError(foreign_file(path, _RESULT_LIMIT) or str(error)) from None
+
+
+def _read_rig(path: Path) -> Rig:
     if path.suffix in (".yaml", ".yml"):
         text = _read_yaml(path)
         return read_ros_yaml(text, path) if looks_like_ros(text) else read_camchain(path)
@@ -96,9 +108,9 @@ def _read_json(path: Path) -> dict[str, Any]:
         try:
             document = json.loads(lines[-1]) if lines else None
         except json.JSONDecodeError:
-            raise ExportError(f"{path}: not JSON: {error}") from None
+            raise ExportError(f"{path}: {_EXPECTED}; not JSON: {error}") from None
     except (UnicodeDecodeError, RecursionError):
-        raise ExportError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
+        raise ExportError(f"{path}: {_EXPECTED}; not JSON") from None
     if not isinstance(document, dict):
-        raise ExportError(f"{path}: not a result of `vical calibrate --json`")
+        raise ExportError(f"{path}: {_EXPECTED}")
     return document

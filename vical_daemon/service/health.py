@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -10,9 +11,37 @@ from dataclasses import replace
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.service import notify
 from vical_daemon.service.wall_clock import WallClock
 
 STATUS_PERIOD_S = 1.0
+CLOCK_STEP_S = 0.1
+"""A step of the system clock that is announced, s. ntpd corrects less than 0.128 s without a step."""
+_log = logging.getLogger(__name__)
+
+
+class _ClockSteps:
+    """Announces steps of the system clock, once in a process whatever the number of its roles."""
+
+    def __init__(self) -> None:
+        self._lock, self._announced_s = threading.Lock(), 0.0
+
+    def take(self, step_s: float) -> None:
+        """Take by how much the system clock is ahead of the clock of all stamps, s."""
+        with self._lock:
+            if abs(step_s - self._announced_s) < CLOCK_STEP_S:
+                return
+            self._announced_s = step_s
+        text = (
+            f"the system clock was set: it is {step_s:+.1f} s ahead of vical's stamps, "
+            "which keep the old time until the next boot"
+        )
+        _log.warning("%s", text)
+        notify.event("clock_set", text, level="warning", step_s=step_s)
+
+
+_clock_steps = _ClockSteps()
+_ANNOUNCE = ("imu", "camera")  # roles that stamp; one process of the service runs both
 
 
 class StatusSender:
@@ -44,6 +73,8 @@ class StatusSender:
 
     def _publish(self, statuses: list[DiagnosticStatus]) -> None:
         clock = DiagnosticStatus(Level.OK, "clock", values=self._clock.status_values())
+        if self._role in _ANNOUNCE:
+            _clock_steps.take(1e-9 * self._clock.step_ns())
         self._bus.publish(self._key, encode_diagnostics(self._clock.now_ns(), self._role, [*statuses, clock]))
 
     def finish(self, statuses: Callable[[], list[DiagnosticStatus]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+_PAUSE_S = 5.0  # without a new item: none arrive any more
 _CALM_S = 300.0  # a failure this long after the last one counts as the first
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
@@ -9,12 +10,15 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 class Progress:
     """Compares the items received with the items settled: used, or rejected with a reason.
 
-    A role whose loop turns is not necessarily alive; one that settles its input is.
+    A role whose loop turns is not necessarily alive; one that settles its input is. An item that waits while
+    no others come is no sign of a failure: the last image before camera and IMU were unplugged waits for the
+    IMU.
     """
 
     def __init__(self) -> None:
         self._received = self._settled = 0
-        self._since_s: float | None = None
+        self._arrived_s: float | None = None  # when the last item arrived, since one was settled
+        self._stuck_s = 0.0
 
     def look(self, received: int, settled: int, now_s: float) -> float:
         """Take the counters as they are now.
@@ -25,13 +29,18 @@ class Progress:
             now_s: A steady clock.
 
         Returns:
-            How long items have arrived without one being settled, s; 0: there is progress.
+            How long items have arrived without one being settled, s; 0: there is progress, or none arrive.
         """
         if settled != self._settled:
-            self._since_s, self._received, self._settled = None, received, settled
-        elif received > self._received and self._since_s is None:
-            self._since_s = now_s
-        return 0.0 if self._since_s is None else now_s - self._since_s
+            self._received, self._settled, self._arrived_s, self._stuck_s = received, settled, None, 0.0
+            return 0.0
+        before_s = self._arrived_s
+        if before_s is not None and now_s - before_s > _PAUSE_S:
+            self._arrived_s, self._stuck_s = None, 0.0
+        if received > self._received:
+            self._stuck_s += 0.0 if self._arrived_s is None else now_s - self._arrived_s
+            self._received, self._arrived_s = received, now_s
+        return self._stuck_s
 
 
 class Restarts:

@@ -57,12 +57,13 @@ def search_tags(
             follows gets the passes over reduced pictures and one of the others in turn.
 
     Returns:
-        Tag ids, shape (n,), each at most once, and the corners 0..3 of each, px, shape (n, 4, 2).
+        Tag ids counted from `target.first_tag`, shape (n,), each at most once, and the corners 0..3 of each,
+        px, shape (n, 4, 2).
     """
     tags = target.tag_cols * target.tag_rows
     found: dict[int, FloatArray] = {}
     for attempt in _passes(gray.shape[1], misses):
-        ids, ordered = decode(image.smooth, _find_quads(gray, attempt), tags)
+        ids, ordered = decode(image.smooth, _find_quads(gray, attempt), tags, target.first_tag)
         known = np.flatnonzero(ids >= 0)
         known = known[np.bincount(ids[known], minlength=tags)[ids[known]] == 1]
         ids, quads = ids[known], ordered[known]

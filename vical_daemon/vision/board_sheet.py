@@ -6,7 +6,7 @@ A checkerboard needs no cv2; the codes of tags come from it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vical_daemon.vision.target import AprilGrid, Checkerboard, Target
 
@@ -164,7 +164,7 @@ def _tag_rectangles(target: AprilGrid) -> list[Rectangle]:
         rectangles += [(x, y, size, border), (x, y + size - border, size, border)]
         rectangles += [(x, y + border, border, size - 2 * border)]
         rectangles += [(x + size - border, y + border, border, size - 2 * border)]
-        for line, bits in enumerate(tag_bits()[tag]):
+        for line, bits in enumerate(tag_bits()[target.first_tag + tag]):
             bottom = y + size - border - (line + 1) * module
             for start, stop in _runs([not white for white in bits]):
                 left = x + border + start * module
@@ -194,8 +194,9 @@ def _labels(target: Target, origin: tuple[float, float]) -> list[Text]:
     left, below = origin[0] + x0 - LABEL_MM, origin[1] + y0 - 0.8 * LABEL_MM
     if isinstance(target, AprilGrid):
         pitch, half = target.pitch_m * 1e3, target.tag_size_m * 5e2
-        rows = [(r * target.tag_cols, r * pitch + half) for r in range(target.tag_rows)]
-        cols = [(c, c * pitch + half) for c in range(target.tag_cols)]
+        first = target.first_tag
+        rows = [(first + r * target.tag_cols, r * pitch + half) for r in range(target.tag_rows)]
+        cols = [(first + c, c * pitch + half) for c in range(target.tag_cols)]
     else:
         rows = [(r * target.cols, -r * target.row_spacing_m * 1e3) for r in range(target.rows)]
         cols = [(c, c * target.col_spacing_m * 1e3) for c in range(target.cols)]
@@ -222,8 +223,9 @@ def _footer(target: Target, width: float) -> tuple[list[Rectangle], list[Text]]:
 def describe(target: Target) -> str:
     """One line for the sheet."""
     if isinstance(target, AprilGrid):
+        begin = f" from id {target.first_tag} on" if target.first_tag else ""
         return (
-            f"vical aprilgrid 36h11  {target.tag_cols} x {target.tag_rows} tags  "
+            f"vical aprilgrid 36h11  {target.tag_cols} x {target.tag_rows} tags{begin}  "
             f"tagSize {target.tag_size_m * 1e3:g} mm  tagSpacing {target.tag_spacing:g}"
         )
     return (
@@ -234,7 +236,7 @@ def describe(target: Target) -> str:
 
 def _resized(target: Target, size_m: float) -> Target:
     if isinstance(target, AprilGrid):
-        return AprilGrid(target.tag_cols, target.tag_rows, size_m, target.tag_spacing)
+        return replace(target, tag_size_m=size_m)
     ratio = target.row_spacing_m / target.col_spacing_m
     return Checkerboard(target.cols, target.rows, round(size_m * ratio, 6), size_m)
 

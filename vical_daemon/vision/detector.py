@@ -21,6 +21,7 @@ from vical_daemon.vision.guided import (
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage
 from vical_daemon.vision.target import AprilGrid, Target
+from vical_daemon.vision.target_check import TargetCheck
 
 MIN_POINTS = 4
 FLOW_POINTS = 24
@@ -65,10 +66,12 @@ class BoardDetector:
     Args:
         target: The board.
         guided: Use the last frames; False: full search on every picture.
+        check: Compares searched pictures with the target file; None: nobody wants to know.
     """
 
-    def __init__(self, target: Target, guided: bool = True) -> None:
+    def __init__(self, target: Target, guided: bool = True, check: TargetCheck | None = None) -> None:
         self.target = target
+        self._check = check
         self.stats = DetectorStats()
         self._layout = BoardLayout.of(target)
         self._guided = guided
@@ -96,7 +99,10 @@ class BoardDetector:
             self.stats.guided += 1
         else:
             fix = self._search(gray)
-        if fix is None or fix.found.sum() < MIN_POINTS:
+        found = fix is not None and fix.found.sum() >= MIN_POINTS
+        if self._check is not None:
+            self._check.take(gray, found=bool(found))
+        if fix is None or not found:
             self._last = None
             self._misses += 1
             return None

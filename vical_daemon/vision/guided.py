@@ -279,7 +279,8 @@ def check_codes(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> Board
     seen = np.flatnonzero(inside & found.any(axis=1))
     if not len(seen):
         return None
-    match = agreement(image.levels(bit_places(quads[seen])), seen)
+    first = layout.target.first_tag if isinstance(layout.target, AprilGrid) else 0
+    match = agreement(image.levels(bit_places(quads[seen])), seen + first)
     if match.mean() < MIN_BOARD_AGREEMENT:
         return None
     hidden = match < MIN_AGREEMENT

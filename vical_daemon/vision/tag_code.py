@@ -65,16 +65,20 @@ def bit_places(quads_px: FloatArray) -> FloatArray:
     return np.asarray(uv.transpose(1, 2, 0))
 
 
-def decode(image: npt.NDArray[np.float32], quads_px: FloatArray, tags: int) -> tuple[IntArray, FloatArray]:
+def decode(
+    image: npt.NDArray[np.float32], quads_px: FloatArray, tags: int, first: int = 0
+) -> tuple[IntArray, FloatArray]:
     """Read the tags in quadrilaterals.
 
     Args:
         image: Grey picture, float32.
         quads_px: Corners of each candidate, counter-clockwise for the viewer, any first corner, (n, 4, 2).
-        tags: Only ids below this are looked for.
+        tags: How many ids are looked for.
+        first: The smallest of them.
 
     Returns:
-        Tag ids, shape (n,), -1 where there is none, and the corners turned so that corner 0 comes first.
+        Tag ids counted from `first`, shape (n,), -1 where there is none, and the corners turned so that
+        corner 0 comes first.
     """
     if not len(quads_px):
         return np.zeros(0, np.int64), quads_px
@@ -82,7 +86,7 @@ def decode(image: npt.NDArray[np.float32], quads_px: FloatArray, tags: int) -> t
     ordered = np.sort(levels, axis=1)
     dark, bright = ordered[:, 5], ordered[:, 30]  # 15 and 85 per cent
     signs = np.where(levels > ((dark + bright) / 2)[:, None], 1.0, -1.0)
-    score = signs @ _turned_words(tags).T
+    score = signs @ _turned_words(tags, first).T
     best = np.argmax(score, axis=1)
     wrong = (BITS * BITS - score[np.arange(len(best)), best]) / 2
     good = (wrong <= MAX_WRONG_BITS) & (bright - dark > MIN_CONTRAST_DN)
@@ -107,8 +111,8 @@ def _centred_words() -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _turned_words(tags: int) -> FloatArray:
-    """Words as +-1 when the first quad corner is corner j of the tag, rows j * tags + id, (4 * tags, 36)."""
-    bits = tag_bits()[:tags]
+def _turned_words(tags: int, first: int) -> FloatArray:
+    """Words as +-1 if the first quad corner is corner j, in row j * tags + id - first, (4 * tags, 36)."""
+    bits = tag_bits()[first : first + tags]
     turned = [np.rot90(bits, -j, axes=(1, 2)).reshape(tags, -1) for j in range(4)]
     return np.where(np.concatenate(turned), 1.0, -1.0)

@@ -34,21 +34,23 @@ MAX_CHECKERBOARD_CORNERS = 200
 class AprilGrid:
     """A grid of AprilTags of the 36h11 family, as Kalibr prints it.
 
-    Tag ids run along x first, then up; ``point_id = 4 * tag_id + corner``, corners 0..3 at (0,0), (s,0),
-    (s,s), (0,s) from the tag's lower-left corner, s = ``tag_size_m``. Tags repeat every
-    ``tag_size_m * (1 + tag_spacing)``.
+    Tag ids run along x first, then up, from ``first_tag`` on. ``point_id = 4 * (tag_id - first_tag) +
+    corner``, corners 0..3 at (0,0), (s,0), (s,s), (0,s) from the tag's lower-left corner, s =
+    ``tag_size_m``. Tags repeat every ``tag_size_m * (1 + tag_spacing)``.
 
     Attributes:
         tag_cols: Tags along x.
         tag_rows: Tags along y.
         tag_size_m: Edge of a tag's black square, m.
         tag_spacing: Gap between tags divided by `tag_size_m`.
+        first_tag: Id of the tag at the origin (Kalibr's `codeOffset`).
     """
 
     tag_cols: int
     tag_rows: int
     tag_size_m: float
     tag_spacing: float
+    first_tag: int = 0
     kind: ClassVar[str] = "aprilgrid"
     alike_upside_down: ClassVar[bool] = False  # each tag says where it belongs
 
@@ -80,6 +82,7 @@ class AprilGrid:
             f"tagRows: {self.tag_rows}\n"
             f"tagSize: {self.tag_size_m!r}     # m, edge of a tag's black square\n"
             f"tagSpacing: {self.tag_spacing!r}     # gap between tags / tagSize\n"
+            + (f"codeOffset: {self.first_tag}     # id of the first tag\n" if self.first_tag else "")
         )
 
 
@@ -135,7 +138,7 @@ def load_target(path: str | Path) -> Target:
     """Read a target YAML in Kalibr's format.
 
     Args:
-        path: The file. ``target_type: aprilgrid`` (tagCols tagRows tagSize tagSpacing) or
+        path: The file. ``target_type: aprilgrid`` (tagCols tagRows tagSize tagSpacing [codeOffset]) or
             ``target_type: checkerboard`` (targetCols targetRows rowSpacingMeters colSpacingMeters).
 
     Raises:
@@ -164,19 +167,20 @@ def _build(file: TargetFile) -> Target:
 
 
 def _aprilgrid(file: TargetFile) -> AprilGrid:
-    file.only("target_type", "tagCols", "tagRows", "tagSize", "tagSpacing")
+    file.only("target_type", "tagCols", "tagRows", "tagSize", "tagSpacing", "codeOffset")
     cols = file.integer("tagCols", 1, TAG_FAMILY_SIZE)
     rows = file.integer("tagRows", 1, TAG_FAMILY_SIZE)
-    if cols * rows > TAG_FAMILY_SIZE:
-        raise file.error(
-            "tagCols", f"{cols} x {rows} tags are more than the {TAG_FAMILY_SIZE} of the 36h11 family"
-        )
+    first = file.integer("codeOffset", 0, TAG_FAMILY_SIZE - 1) if "codeOffset" in file.values else 0
+    if first + cols * rows > TAG_FAMILY_SIZE:
+        begin = f" from id {first} on" if first else ""
+        text = f"{cols} x {rows} tags{begin} are more than the {TAG_FAMILY_SIZE} of the 36h11 family"
+        raise file.error("tagCols", text)
     size = file.length("tagSize", 0.002, 2.0)
     spacing = file.number(
         "tagSpacing", 0.02, MAX_SPACING_RATIO, hint="it is the gap divided by tagSize, often 0.3"
     )
     _check_board_size(file, "tagSize", max(cols, rows) * size * (1 + spacing))
-    return AprilGrid(cols, rows, size, spacing)
+    return AprilGrid(cols, rows, size, spacing, first)
 
 
 def _checkerboard(file: TargetFile) -> Checkerboard:

@@ -67,7 +67,10 @@ class TargetFile:
             line = key_node.start_mark.line + 1
             key = key_node.value
             if not isinstance(key, str) or not isinstance(value_node, yaml.ScalarNode):
-                raise TargetError(f"{path}: line {line}: expected 'key: number', not a list or a block")
+                raise TargetError(
+                    f"{path}: line {line}: a list or a block, not a line like 'tagCols: 6'; "
+                    "is it a target file?"
+                )
             if key in values:
                 raise TargetError(f"{path}: {key}: given twice (lines {lines[key]} and {line}); keep one")
             values[key] = value_node.value

@@ -329,6 +329,10 @@ def test_levels() -> None:
     assert _level(replace(good, data_age_s=3.0), queue, 1.0)[0] is not Level.ERROR
     assert _level(replace(good, state="lost", problem="gone"), queue, 100.0) == (Level.ERROR, "gone")
     assert _level(good, queue, 200.0)[0] is Level.WARN
+    silent = replace(good, state="silent", openings=1)
+    assert _level(replace(silent, state="opening", openings=0), queue, 100.0)[0] is Level.WARN
+    assert _level(silent, queue, 100.0) == (Level.WARN, "open, no data yet")  # for a second at each start
+    assert _level(replace(silent, openings=2), queue, 100.0)[0] is Level.ERROR
     queue.close()
 
 

@@ -14,13 +14,18 @@ from scipy.spatial.transform import Rotation
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_calibration, encode_diagnostics
+from vical_daemon.calibrate.checkpoint import Checkpoint
+from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.in_use import NothingInUseError, calibration_in_use
 from vical_daemon.calibrate.persistence import CalibrationPersistence
-from vical_daemon.config.model import Config, loads
+from vical_daemon.calibrate.role import _Supervisor
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import Config, VerifyConfig, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.status.mounting_changes import differences
 from vical_daemon.estimation.wording import event_text
+from vical_daemon.results.store import CalibrationStore, StoreError
 from vical_daemon.service.wall_clock import private_clock
 
 
@@ -110,6 +115,36 @@ def test_a_stored_lens_of_another_image_size_is_not_used(config: Config) -> None
     persistence = _later(config)
     assert persistence.priors()["cam0"].intrinsics == (500, 500, 320, 240)
     assert set(calibration_in_use(config, persistence, 0).known) == {"cam0"}
+
+
+def test_a_file_for_images_of_another_size_is_not_verified(config: Config, tmp_path: Path) -> None:
+    rows = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    lens = "intrinsics: [920, 920, 640, 480], distortion_coeffs: [0, 0, 0, 0]"
+    (tmp_path / "chain.yaml").write_text(f"cam0: {{T_cam_imu: {rows}, {lens}, resolution: [1280, 960]}}\n")
+    config = replace(config, verify=VerifyConfig(str(tmp_path / "chain.yaml")), path=tmp_path / "vical.yaml")
+    with pytest.raises(NothingInUseError, match=r"chain.yaml is for images of 1280 x 960 px, not 640 x 480"):
+        calibration_in_use(config, _later(config), 0)
+
+
+def test_a_store_that_cannot_be_written_stays_in_the_status_until_it_can(
+    config: Config, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`converged` with a full disk: after the next boot the calibration would be gone."""
+    persistence, save, clock = _later(config), CalibrationStore.save, private_clock()
+
+    def full(*_: object) -> None:
+        raise StoreError("x.json cannot be written: No space left on device")
+
+    free = replace(config, calibration=replace(config.calibration, mode="target_free"))
+    role = EstimateRole(free, make_estimator(free, persistence.priors()))
+    supervisor = _Supervisor(free, role, persistence, Checkpoint(None, free, clock))
+    for store, level in ((full, Level.WARN), (full, Level.WARN), (save, Level.OK)):
+        monkeypatch.setattr(CalibrationStore, "save", store)
+        persistence.save(_estimate(_camera()))
+        status = supervisor.statuses(0, 0.0)[0]
+        assert status.level is level
+        assert ("; not stored: x.json cannot be written" in status.message) is (level is Level.WARN)
+    assert len(caplog.records) == 1
 
 
 def test_nothing_is_stored_before_convergence(config: Config) -> None:

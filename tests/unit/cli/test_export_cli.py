@@ -147,7 +147,7 @@ def test_store_gives_the_newest_calibration(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [("nonsense", "not JSON"), ("[1]", "not a result"), ("{}", "cameras"), ("", "not a result")],
+    [("nonsense", "not JSON"), ("[1]", "not a calibration"), ("{}", "cameras"), ("", "not a calibration")],
 )
 def test_wrong_sources_are_one_line(tmp_path, capsys, content, says):
     path = tmp_path / "x.json"

@@ -67,6 +67,47 @@ def test_a_verification_is_shown_with_the_calibration_in_use(bus: LocalBus, caps
     assert json.loads(capsys.readouterr().out)["verify"]["verdict"] == "changed"
 
 
+def _status(bus: LocalBus, level: Level, message: str) -> None:
+    status = DiagnosticStatus(level, "imu/imu0", message)
+    bus.publish(topics.STATUS.key("rover", "imu"), encode_diagnostics(1, "imu", [status]))
+
+
+def test_once_names_what_does_not_work(bus: LocalBus, capsys) -> None:
+    """With the IMU unplugged the last estimate is still `converged`."""
+    _publish(bus, "rover", Status.CONVERGED)
+    problem = "the port is gone; check the cable"
+    _status(bus, Level.ERROR, problem)
+    assert main(["watch", "--once"]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert " converged " in first and second == f"rover  imu/imu0  error: {problem}"
+    assert main(["watch", "--once", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["problems"] == [
+        {
+            "rig": "rover",
+            "component": "imu/imu0",
+            "level": "error",
+            "message": "the port is gone; check the cable",
+        }
+    ]
+
+
+def test_a_pipe_gets_a_line_when_a_component_fails_and_when_it_is_back(bus: LocalBus, capsys) -> None:
+    view = watch.View("*", as_json=False)
+    view.begin(bus)
+    for level, text in (
+        (Level.OK, "100 Hz"),
+        (Level.ERROR, "no data for 2.1 s"),
+        (Level.ERROR, "no data for 3.1 s"),
+        (Level.OK, "100 Hz, 0 lost"),
+    ):
+        _status(bus, level, text)
+        view.print_new()
+    assert capsys.readouterr().out.splitlines() == [
+        "rover  imu/imu0  error: no data for 2.1 s",
+        "rover  imu/imu0  ok: 100 Hz, 0 lost",
+    ]
+
+
 def test_nothing_there_is_one_line(bus: LocalBus, capsys) -> None:
     assert main(["watch", "--once", "--timeout", "0.3"]) == 1
     assert "is `vical run` (vical.target) up?" in capsys.readouterr().err

@@ -254,6 +254,37 @@ class TestInitial:
         with pytest.raises(ConfigError, match=r"cam0\.T_imu_cam: T_cam_imu is given, too.* line 1"):
             self.read(tmp_path, both)
 
+    def test_a_camera_without_a_pose_is_placed_by_the_one_before(self, tmp_path: Path) -> None:
+        """T_cn_cnm1 maps points of the camera before into this one; PyYAML's files have cam10 before cam9."""
+        text = (
+            "cam10: {T_cn_cnm1: [[1,0,0,0],[0,1,0,0.5],[0,0,1,0],[0,0,0,1]]}\n"
+            "cam8: {T_cam_imu: [[0,1,0,0.1],[-1,0,0,0.2],[0,0,1,0.3],[0,0,0,1]]}\n"
+            "cam9: {T_cn_cnm1: [[0,0,1,0.25],[0,1,0,0],[-1,0,0,0],[0,0,0,1]]}\n"
+        )
+        cameras = self.read(tmp_path, text).cameras
+        point = np.array([0.7, -0.3, 2.0])  # in the imu frame; by hand, from camera to camera:
+        in_8 = np.array([point[1] + 0.1, -point[0] + 0.2, point[2] + 0.3])
+        in_9 = np.array([in_8[2] + 0.25, in_8[1], -in_8[0]])
+        in_10 = np.array([in_9[0], in_9[1] + 0.5, in_9[2]])
+        for name, expected in (("cam8", in_8), ("cam9", in_9), ("cam10", in_10)):
+            R_imu_cam, p_imu_cam = cameras[name].T_imu_cam or (None, None)
+            assert R_imu_cam is not None and p_imu_cam is not None
+            np.testing.assert_allclose(R_imu_cam @ expected + p_imu_cam, point, atol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("text", "says"),
+        [
+            ('{"t_ns": 5, "cameras": {}}', "a result of vical; `vical export .*initial.yaml --format kalibr"),
+            ("image_width: 752\ncamera_matrix:\n  rows: 3\n", "a file of ROS; .* Kalibr's form"),
+            ("sensor_type: camera\nT_BS: {cols: 4}\n", "EuRoC's sensor.yaml"),
+            ("target_type: aprilgrid\ntagCols: 6\n", "a target file; give it with --target"),
+            ("rig: rover\ncameras: {cam0: {uri: x}}\n", "a config of vical; .*`cam0: {intrinsics"),
+        ],
+    )
+    def test_files_of_other_tools_are_named(self, tmp_path: Path, text: str, says: str) -> None:
+        with pytest.raises(ConfigError, match=says):
+            self.read(tmp_path, text)
+
     def test_kalibr_imu_yaml_at_the_top_level(self, tmp_path: Path) -> None:
         initial = self.read(
             tmp_path,

@@ -30,7 +30,7 @@ def config() -> Config:
 
 
 def _frame(t_ms: int, **changes: Any) -> Frame:
-    image = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16)
     values = {"t_exposure_mid_ns": t_ms * MS, "t_arrival_ns": 0, "sequence": 0, "image": image}
     return Frame(**(values | {"encoding": "mono8", "stamp_rule": "simulated"} | changes))
 
@@ -48,7 +48,7 @@ class TestDetect:
         ((key, payload),) = self._role(config, found).points(self._sample(1234))
         message = decode_points(payload)
         assert key == "vical/rover/camera/cam0/points" and message.stamp_ns == 1234 * MS
-        assert message.image_size == (8, 6) and message.ids.tolist() == [3, 5]
+        assert message.image_size == (16, 16) and message.ids.tolist() == [3, 5]
         np.testing.assert_array_equal(message.uv_px, found.uv_px)
 
     def test_an_image_without_a_board_is_said_too(self, config: Config) -> None:

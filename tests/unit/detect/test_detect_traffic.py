@@ -49,12 +49,45 @@ class TestDetect:
             done += bool(role.points(image(NOW + k * 50 * MS)))
         assert done == 60
 
-    def test_images_of_another_size_are_refused_until_they_stay(self, config: Config) -> None:
+    def test_images_of_another_size_are_refused_and_named(self, config: Config) -> None:
+        """A camera that came back on USB 2 at half size: its pixels are those of another lens."""
         role = DetectRole(config, "cam0", lambda picture, t_ns: None)
-        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48), (1, 1), (1, 1)] + [(64, 48)] * 3 + [(32, 24)] * 4
+        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48)] + [(32, 24)] * 6
         done = [bool(role.points(image(NOW + k * 100 * MS, size))) for k, size in enumerate(sizes)]
-        assert done == [True] * 3 + [False, True, False, False] + [True] * 3 + [False, False, True, True]
-        assert role.status().values["malformed"] == "5"
+        assert done == [True] * 3 + [False, True] + [False] * 6
+        status = role.status()
+        assert status.level is Level.ERROR and status.values["of_another_size"] == "7"
+        assert status.message == "images are 32 x 24 px, not 64 x 48 as in the config: not used"
+        assert role.points(image(NOW + 2000 * MS))
+        assert role.status().level is Level.OK
+
+    def test_a_wrong_target_file_is_told_in_the_status_and_the_journal(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        events: list[tuple[str, str]] = []
+        monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append((name, text)))
+        tells: list[Any] = []
+
+        def make(_config: Config, _predictor: Any, tell: Any) -> Any:
+            tells.append(tell)
+            return lambda picture, t_ns: None
+
+        monkeypatch.setattr(detect, "make_detector", make)
+        role = DetectRole(config, "cam0")
+        role.points(image(NOW))
+        tells[0]("the tags stand in rows of 6, the target file states tagCols: 5")
+        status = role.status()
+        assert status.level is Level.ERROR and status.message.startswith("the tags stand in rows of 6")
+        assert events == [("wrong_target", f"cam0: {status.message}")]
+
+    def test_a_computer_that_is_too_slow_is_named(self, config: Config) -> None:
+        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
+        for k in range(60):
+            role.points(image(NOW + k * 100 * MS))
+        assert "dropped:" not in role.status(dropped=3).message
+        status = role.status(dropped=70)
+        assert status.level is Level.WARN
+        assert "; 70 were dropped: this computer is too slow for them (" in status.message
 
     def test_a_detector_that_raises_is_made_anew(
         self, config: Config, monkeypatch: pytest.MonkeyPatch

@@ -8,8 +8,8 @@ import pytest
 
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_diagnostics
-from vical_daemon.service import health
-from vical_daemon.service.wall_clock import WallClock
+from vical_daemon.service import health, notify, wall_clock
+from vical_daemon.service.wall_clock import WallClock, private_clock
 
 
 def test_a_busy_role_repeats_its_status_until_it_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,3 +33,23 @@ def test_a_busy_role_repeats_its_status_until_it_is_stuck(monkeypatch: pytest.Mo
     count = len(heard)
     time.sleep(0.2)
     assert len(heard) == count
+
+
+def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NTP steps by an hour and back; IMU and camera run in one process; a slew of milliseconds is nothing."""
+    events: list[str] = []
+    monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append(f"{name}: {text}"))
+    monkeypatch.setattr(health, "_clock_steps", health._ClockSteps())
+    clock, bus = private_clock(), LocalBus()
+    senders = [health.StatusSender("rig0", role, bus, clock) for role in ("imu", "camera", "record")]
+    for offset_s in (0.0, 0.004, 3600.0, 3600.0, 0.0, 0.0):
+        monkeypatch.setattr(
+            wall_clock, "measure_offset_ns", lambda s=offset_s: clock.offset_ns + round(1e9 * s)
+        )
+        for sender in senders:
+            sender.tick(list, force=True)
+    tail = "which keep the old time until the next boot"
+    assert events == [
+        f"clock_set: the system clock was set: it is {step} s ahead of vical's stamps, {tail}"
+        for step in ("+3600.0", "+0.0")
+    ]

@@ -16,6 +16,19 @@ def test_progress_is_what_is_done_not_that_somebody_speaks() -> None:
     assert progress.look(10, 6, 200.0) == 0.0
 
 
+def test_an_image_that_waits_while_no_other_comes_is_no_lack_of_progress() -> None:
+    """A USB hub was gone for 15 s: the last image has no inertial data, and the estimator started again."""
+    progress = Progress()
+    progress.look(100, 98, 0.0)
+    for k in range(1, 300):
+        assert progress.look(102, 98, 0.1 * k) < 0.2
+    for k in range(40):  # back, and not one of 12.5 images a second is used
+        stuck_s = progress.look(103 + k, 98, 30.0 + 0.08 * k)
+    assert abs(stuck_s - 39 * 0.08) < 1e-9
+    assert progress.look(142, 98, 40.0) == 0.0
+    assert progress.look(143, 100, 40.1) == 0.0
+
+
 def test_restarts_come_later_and_later_but_not_never() -> None:
     restarts = Restarts()
     pauses = [restarts.failed("why", 1.0 + k) for k in range(12)]

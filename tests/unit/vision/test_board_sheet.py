@@ -24,7 +24,11 @@ from vical_daemon.vision.detector import BoardDetector
 from vical_daemon.vision.sheet_files import POINTS_PER_MM, to_pdf, to_svg
 from vical_daemon.vision.target import AprilGrid, Checkerboard, load_target
 
-BOARDS = [AprilGrid(4, 3, 0.04, 0.3), AprilGrid(3, 3, 0.04, 0.25), Checkerboard(7, 6, 0.02, 0.025)]
+BOARDS = [
+    AprilGrid(4, 3, 0.04, 0.3),
+    AprilGrid(3, 3, 0.04, 0.25, first_tag=36),
+    Checkerboard(7, 6, 0.02, 0.025),
+]
 
 
 def svg_rectangles(svg, height):

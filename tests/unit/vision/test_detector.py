@@ -48,6 +48,14 @@ def test_aprilgrid_is_known_whichever_way_up(film, aprilgrid, roll_rad):
     assert np.abs(error).max() < 0.15
 
 
+def test_an_aprilgrid_whose_ids_begin_elsewhere(film, aprilgrid):
+    board = AprilGrid(6, 6, 0.088, 0.3, first_tag=36)
+    camera = film(board, 0.9)
+    for found, error, seen in run(camera, BoardDetector(board), board, 3):  # searched, then followed
+        assert len(found.ids) >= 0.9 * seen.sum() and np.abs(error).max() < 0.15
+    assert BoardDetector(aprilgrid).detect(camera.render(0.0), 0) is None  # none of its tags is there
+
+
 @pytest.mark.parametrize("board", [AprilGrid(6, 6, 0.088, 0.3), Checkerboard(8, 7, 0.05, 0.05)])
 def test_fisheye(film, fisheye, board):
     camera = film(board, 0.35 if board.kind == "checkerboard" else 0.5, lens=fisheye)

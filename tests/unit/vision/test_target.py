@@ -36,7 +36,17 @@ def test_checkerboard_ids_run_along_columns_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(target.points_m[2 * 8 + 3], [3 * 0.04, 2 * 0.05, 0.0])
 
 
-@pytest.mark.parametrize("text", [APRIL, CHECKER])
+def test_the_first_tag_may_have_another_id(tmp_path: Path) -> None:
+    """`codeOffset: 0` is in the example of Kalibr's wiki; points are numbered from the first tag on."""
+    assert load_target(write(tmp_path, APRIL + "codeOffset: 0   # of the first tag\n")) == load_target(
+        write(tmp_path, APRIL)
+    )
+    second = load_target(write(tmp_path, APRIL + "codeOffset: 30\n"))
+    assert isinstance(second, AprilGrid) and second.first_tag == 30
+    np.testing.assert_array_equal(second.points_m, AprilGrid(6, 5, 0.088, 0.3).points_m)
+
+
+@pytest.mark.parametrize("text", [APRIL, APRIL + "codeOffset: 30\n", CHECKER])
 def test_yaml_round_trip(tmp_path: Path, text: str) -> None:
     target = load_target(write(tmp_path, text))
     assert load_target(write(tmp_path, target.to_yaml())) == target
@@ -61,6 +71,8 @@ def test_points_are_read_only(tmp_path: Path) -> None:
         (APRIL.replace("tagCols: 6", "tagCols: 6.5"), ["tagCols", "whole number", "line 2"]),
         (APRIL.replace("tagCols: 6", "tagCols: 60").replace("tagRows: 5", "tagRows: 50"), ["587"]),
         (APRIL.replace("tagSpacing: 0.3", "tagSpacing: 30"), ["tagSpacing", "above 2"]),
+        (APRIL + "codeOffset: 560\n", ["tagCols", "from id 560 on", "587"]),
+        (APRIL + "codeOffset: -1\n", ["codeOffset", "below 0", "line 6"]),
         (APRIL.replace("0.088", "2").replace("tagCols: 6", "tagCols: 60"), ["board of"]),
         (APRIL + "tagSize: 0.1\n", ["given twice", "lines 4 and 6"]),
         (APRIL.replace("tagCols: 6", "tagCols: [6]"), ["line 2", "list"]),

@@ -17,6 +17,7 @@ SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
 images and inertial readings arrive shows the greater part."""
 _FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
+_SINKS = 1e-3  # by which the largest lead follows each image that is later
 _AGREE = 5  # images in a row that show the same step
 _SETTLED = 10  # images after which the usual lead is known; a role may hold back the first three
 
@@ -32,10 +33,12 @@ class _Stream:
         offset_s: Added to the stamps, for the steps of the clock so far.
         usual_s: Interval between images.
         repeats: Copies of the newest image since.
-        stepped_s: Leads of the latest images, all far from the usual one.
+        stepped_s: Steps that the latest images show.
         heard_s: Newest inertial reading when the last image arrived.
         images: Images so far.
         off_s: Lead of the last image minus the usual one.
+        most_s: Largest lead, s: of images that did not have to wait. It sinks slowly, as clocks drift.
+        last_s: Lead of the last image that was taken, s.
     """
 
     newest: PointsFrame
@@ -48,6 +51,30 @@ class _Stream:
     heard_s: float = -np.inf
     images: int = 1
     off_s: float = 0.0
+    most_s: float = -np.inf
+    last_s: float = 0.0
+
+    def follow(self, lead_s: float) -> None:
+        """Follow the lead of an image that was taken, s."""
+        self.lead_s += _FOLLOW * (lead_s - self.lead_s)
+        self.most_s = max(lead_s, self.most_s + _SINKS * (lead_s - self.most_s))
+        self.last_s = lead_s
+
+    def is_set(self, lead_s: float, newest_imu_s: float, imu_jump_s: float) -> bool:
+        """Whether an image shows that one of the clocks was set, or goes on to show it.
+
+        Args:
+            lead_s: Of the image, s.
+            newest_imu_s: See `ImageIntake.take`.
+            imu_jump_s: How far the stamps of readings jumped forwards since the last image, s: a gap, unless
+                those of the images are now as far behind.
+        """
+        step_s = lead_s - self.last_s
+        ahead = lead_s > self.most_s + SEARCHED_S
+        back = step_s < -SEARCHED_S and lead_s + newest_imu_s < self.newest_s
+        behind = step_s < -max(SEARCHED_S, 0.5 * imu_jump_s) and imu_jump_s > SEARCHED_S
+        goes_on = bool(self.stepped_s) and abs(step_s - self.stepped_s[-1]) <= SEARCHED_S < abs(step_s)
+        return ahead or back or behind or goes_on
 
 
 @dataclass(slots=True)
@@ -57,8 +84,10 @@ class ImageIntake:
     A camera or driver that hangs delivers its last image again under new stamps; measured points never repeat
     to the last bit by themselves. Such images are left out: what remains is a gap like any other.
 
-    A clock that is set by seconds shows in the order of arrival: stamps are suddenly far from those of the
-    inertial readings that arrive with them. They are moved back to where they usually are.
+    A clock that is set by seconds shows in the order of arrival. From one image to the next, stamps are
+    further ahead of the inertial readings than ever, or go back, or those of the readings jump. They are
+    moved to where they were. Images that only come late are no sign of it: they wait for a busy detector, by
+    seconds, and catch up when it drops some.
 
     Attributes:
         repeated: Images left out because they were the last one again.
@@ -68,27 +97,36 @@ class ImageIntake:
     _streams: dict[str, _Stream] = field(default_factory=dict)
     _news: list[Event] = field(default_factory=list)
 
-    def take(self, frame: PointsFrame, t_cam_s: float, newest_imu_s: float) -> float | None:
+    def take(
+        self,
+        frame: PointsFrame,
+        t_cam_s: float,
+        newest_imu_s: float,
+        imu_jump: tuple[float, float] = (-np.inf, 0.0),
+    ) -> float | None:
         """Look at one image.
 
         Args:
             frame: The image.
             t_cam_s: Its stamp, s.
             newest_imu_s: Stamp of the newest inertial reading, s.
+            imu_jump: Where the stamps of readings last jumped forwards, and how far, s.
 
         Returns:
             Its stamp on an axis without steps, s; None where the image is to be left out.
         """
         stream = self._streams.get(frame.camera)
         if stream is None:
-            self._streams[frame.camera] = _Stream(frame, t_cam_s, t_cam_s - newest_imu_s)
+            lead_s = t_cam_s - newest_imu_s
+            self._streams[frame.camera] = _Stream(frame, t_cam_s, lead_s, most_s=lead_s, last_s=lead_s)
             return t_cam_s
         if _same(stream.newest, frame):
             stream.repeats += 1
             self.repeated += 1
             return None
         t_s = t_cam_s + stream.offset_s
-        if not self._in_step(stream, frame.camera, t_s - newest_imu_s, newest_imu_s):
+        jump_s = imu_jump[1] if imu_jump[0] > stream.heard_s else 0.0
+        if not self._in_step(stream, frame.camera, t_s - newest_imu_s, newest_imu_s, jump_s):
             return None
         t_s = t_cam_s + stream.offset_s
         self._measure(stream, frame, t_s)
@@ -98,23 +136,29 @@ class ImageIntake:
         """By how much more the last image was ahead of the newest inertial reading than usual, s."""
         return self._streams[camera].off_s if camera in self._streams else 0.0
 
-    def _in_step(self, stream: _Stream, camera: str, lead_s: float, newest_imu_s: float) -> bool:
-        """Whether a stamp is about where it usually is; a clock that has been set is followed."""
+    def _in_step(
+        self, stream: _Stream, camera: str, lead_s: float, newest_imu_s: float, imu_jump_s: float
+    ) -> bool:
+        """Whether a stamp is in step with those before; a clock that has been set is followed."""
         heard, stream.heard_s = newest_imu_s > stream.heard_s, newest_imu_s
-        off_s = stream.off_s = lead_s - stream.lead_s
+        stream.off_s = lead_s - stream.lead_s
         stream.images += 1
-        if off_s > 0.0 and stream.images < _SETTLED:  # the first ones came late, held back until believed
-            stream.lead_s, off_s = lead_s, 0.0
-        if abs(off_s) <= SEARCHED_S:
-            stream.lead_s += _FOLLOW * off_s if heard else 0.0
+        if (
+            stream.off_s > 0.0 and stream.images < _SETTLED
+        ):  # the first ones came late, held back until believed
+            stream.lead_s = stream.most_s = stream.last_s = lead_s
+        if not stream.is_set(lead_s, newest_imu_s, imu_jump_s):
+            if heard:
+                stream.follow(lead_s)
             stream.stepped_s.clear()
             return True
         if not heard:  # no inertial data arrive: nothing to compare with
             stream.newest_s = lead_s + newest_imu_s
             return False
-        if stream.stepped_s and abs(off_s - stream.stepped_s[-1]) > SEARCHED_S:
+        step_s = lead_s - stream.last_s
+        if stream.stepped_s and abs(step_s - stream.stepped_s[-1]) > SEARCHED_S:
             stream.stepped_s.clear()
-        stream.stepped_s.append(off_s)
+        stream.stepped_s.append(step_s)
         if len(stream.stepped_s) < _AGREE:
             return False
         step_s = float(np.median(stream.stepped_s))

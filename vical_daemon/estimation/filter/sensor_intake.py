@@ -79,7 +79,8 @@ class SensorIntake:
         """
         assert self._imu.buffer is not None
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
-        t_cam_s = self._images.take(frame, stamp_s, self._imu.buffer.newest_s)
+        jump = (self._imu.gap_end_s, self._imu.gap_s)
+        t_cam_s = self._images.take(frame, stamp_s, self._imu.buffer.newest_s, jump)
         self._imu.saw_image(self._images.ahead_s(frame.camera))
         return t_cam_s
 

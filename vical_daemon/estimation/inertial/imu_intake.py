@@ -50,6 +50,7 @@ class ImuIntake:
         clipped: Readings of which a channel is at its range.
         between: Another recording was announced, and no reading of it has been added yet.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
+        gap_s: How far stamps jumped forwards there, s; 0: backwards, or there was none.
     """
 
     def __init__(self) -> None:
@@ -58,7 +59,7 @@ class ImuIntake:
         self.refused = 0
         self.repeated = 0
         self.clipped = 0
-        self.gap_end_s = -np.inf
+        self.gap_end_s, self.gap_s = -np.inf, 0.0
         self.between = False
         self._steps = StampSteps()
         self._set_back_s = 0.0  # by how much the clock has been set back in all
@@ -211,6 +212,7 @@ class ImuIntake:
     ) -> list[Reading]:
         """Two readings agree that time has jumped."""
         self._held = None
+        self.gap_s = max(held_s - self._newest_s, 0.0)
         if held_s <= self._newest_s:
             back_s = self._newest_s + (t_s - held_s) - held_s
             self._set_back_s += back_s

@@ -160,8 +160,11 @@ def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> li
         return [f for f in recording.points_frames(stream.name) if len(f.ids)]
     from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
+    from vical_daemon.vision.target_check import TargetCheck
 
-    detect = BoardDetector(load_target(Path(target))).detect
+    board = load_target(Path(target))
+    check = TargetCheck(board, lambda text: warn(f"{stream.name}: {text}"))
+    detect = BoardDetector(board, check=check).detect
     frames, unreadable = [], 0
     for _, payload in recording.messages([stream]):
         try:

@@ -8,14 +8,10 @@ camera before to this one.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import yaml
-from vical_drivers.user_files import read_text
-
-from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+from vical_daemon.config.priors import Initial, priors_in
+from vical_daemon.config.strict_yaml import ConfigError, Document, Value, read
+from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.results.export.rig import ExportError, Rig, RigCamera
 from vical_daemon.results.export.text import comment, matrix_rows, number, row
 
@@ -63,37 +59,46 @@ def write_imu(noise: ImuNoise, topic: str = "/imu0", note: str = "") -> str:
 def read_camchain(path: Path) -> Rig:
     """Read camchain-imucam.yaml (every camera needs its own T_cam_imu, or a chain to one), or OpenVINS's.
 
+    The sections of cameras and IMUs are checked as those of `--initial`; other keys of the file are left out.
+
     Raises:
         ExportError: Not such a file; the message says which key is missing or wrong.
     """
-    blocks, imu = _mapping(path), None
-    if isinstance(named := blocks.get("relative_config_imucam"), str):  # OpenVINS's estimator_config.yaml
-        if isinstance(blocks.get("relative_config_imu"), str):
-            imu = _mapping(_named_by(path, blocks["relative_config_imu"]))
+    document, imu = _document(path), None
+    if isinstance(named := document.root.get("relative_config_imucam"), str):  # OpenVINS's estimator_config
+        if isinstance(of_imu := document.root.get("relative_config_imu"), str):
+            imu = _document(_named_by(path, of_imu))
         path = _named_by(path, named)
-        blocks = _mapping(path)
-    names = sorted(k for k in blocks if isinstance(k, str) and k.startswith("cam"))
+        document = _document(path)
+    names = [name for name in document.root if name.startswith("cam")]
     if not names:
         raise ExportError(f"{path}: no camera (cam0: …) in it; is it a Kalibr camchain?")
-    cameras: dict[str, RigCamera] = {}
-    before: FloatArray | None = None
-    for name in names:
-        camera = _read_camera(name, blocks[name], before, path)
-        cameras[name] = camera
-        before = camera.T_cam_imu
-    return Rig(cameras, noise=_noise_in(imu or blocks), note=f"from {path.name} (Kalibr)")
+    priors = _priors(document)
+    cameras = {name: _rig_camera(name, priors.cameras[name], document.root[name], path) for name in names}
+    noise = (priors if imu is None else _priors(imu)).imu_noise or ImuNoise()
+    return Rig(cameras, noise=noise, note=f"from {path.name} (Kalibr)")
 
 
-def _mapping(path: Path) -> dict[str, Any]:
+def _document(path: Path) -> Document:
+    """Parse a file, and keep the sections of cameras and IMUs and what names other files."""
     try:
-        text = read_text(path, MAX_BYTES).removeprefix("%YAML:1.0")  # OpenCV's first line, in OpenVINS's file
-        refuse_hostile(text, path.name)
-        document = yaml.safe_load(text)
-    except OSError as error:
-        raise ExportError(f"{path}: {error.strerror or error}") from None
-    except (ConfigError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ExportError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
-    return document if isinstance(document, dict) else {}
+        document = read(path)
+    except ConfigError as error:
+        raise ExportError(str(error)) from None
+    document.root = {
+        key: value
+        for key, value in document.root.items()
+        if (key.startswith(("cam", "imu")) and isinstance(value, dict)) or key.startswith("relative_config")
+    }
+    return document
+
+
+def _priors(document: Document) -> Initial:
+    document.root = {key: value for key, value in document.root.items() if isinstance(value, dict)}
+    try:
+        return priors_in(document)
+    except ConfigError as error:
+        raise ExportError(str(error)) from None
 
 
 def _named_by(path: Path, name: str) -> Path:
@@ -103,85 +108,28 @@ def _named_by(path: Path, name: str) -> Path:
     return named
 
 
-def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: Path) -> RigCamera:
-    if not isinstance(block, dict):
-        raise ExportError(f"{path}: {name} must be a section")
-    if block.get("camera_model", "pinhole") != "pinhole":
-        raise ExportError(
-            f"{path}: {name}.camera_model {block['camera_model']!r} is not known here, only pinhole"
-        )
-    model = str(block.get("distortion_model", "radtan"))
-    if model not in ("radtan", "equidistant"):
-        raise ExportError(f"{path}: {name}.distortion_model {model!r} is neither radtan nor equidistant")
-    if "T_cam_imu" in block:
-        T_cam_imu = _matrix(block["T_cam_imu"], f"{name}.T_cam_imu", path)
-    elif "T_imu_cam" in block:  # OpenVINS
-        T_cam_imu = np.asarray(np.linalg.inv(_matrix(block["T_imu_cam"], f"{name}.T_imu_cam", path)))
-    elif "T_cn_cnm1" in block and T_before_imu is not None:
-        T_cam_imu = _matrix(block["T_cn_cnm1"], f"{name}.T_cn_cnm1", path) @ T_before_imu
-    else:
+def _rig_camera(name: str, prior: CameraPrior, section: Value, path: Path) -> RigCamera:
+    """Make a camera of a prior that has everything but, perhaps, the time shift."""
+    assert isinstance(section, dict)
+    if prior.T_imu_cam is None:
         raise ExportError(f"{path}: {name} has no T_cam_imu; run the camera-imu step of Kalibr first")
-    fx, fy, cx, cy = _numbers(block, "intrinsics", 4, name, path)
-    distortion = tuple(_numbers(block, "distortion_coeffs", 4, name, path))
-    width, height = _numbers(block, "resolution", 2, name, path)
+    needed = {"intrinsics", "resolution"}
+    if section.get("distortion_model") != "none":
+        needed.add("distortion_coeffs")
+    for key in sorted(needed):
+        if section.get(key) is None:
+            raise ExportError(f"{path}: {name} has no {key}")
+    assert prior.intrinsics is not None
     return RigCamera(
         name=name,
-        R_imu_cam=T_cam_imu[:3, :3].T,
-        p_imu_cam=-T_cam_imu[:3, :3].T @ T_cam_imu[:3, 3],
-        timeshift_cam_imu_s=_number(block, "timeshift_cam_imu", name, path),
-        intrinsics=(fx, fy, cx, cy),
-        distortion_model=model,
-        distortion=distortion,
-        resolution=(int(width), int(height)),
-        topic=str(block.get("rostopic", "")),
+        R_imu_cam=prior.T_imu_cam[0],
+        p_imu_cam=prior.T_imu_cam[1],
+        timeshift_cam_imu_s=prior.timeshift_cam_imu_s or 0.0,
+        intrinsics=prior.intrinsics,
+        distortion_model=prior.distortion_model,
+        distortion=tuple(prior.coefficients()),
+        resolution=prior.resolution,
+        readout_s=prior.readout_s,
+        readout_axis=prior.readout_axis,
+        topic=str(section.get("rostopic") or ""),
     )
-
-
-def _matrix(value: Any, what: str, path: Path) -> FloatArray:
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (4, 4):
-        raise ExportError(f"{path}: {what} must be a 4x4 matrix of numbers")
-    if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-4):
-        raise ExportError(f"{path}: the rotation in {what} is not orthonormal")
-    return matrix
-
-
-def _numbers(block: dict[str, Any], key: str, count: int, name: str, path: Path) -> list[float]:
-    values = block.get(key)
-    try:
-        numbers = [float(v) for v in values] if isinstance(values, list) else []
-    except (TypeError, ValueError):
-        numbers = []
-    if len(numbers) != count:
-        raise ExportError(f"{path}: {name}.{key} must be a list of {count} numbers")
-    return numbers
-
-
-def _number(block: dict[str, Any], key: str, name: str, path: Path) -> float:
-    value = block.get(key, 0.0)
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ExportError(f"{path}: {name}.{key} must be a number") from None
-
-
-def _noise_in(blocks: dict[str, Any]) -> ImuNoise:
-    """Read imu0 where the file has it (some tools join both files)."""
-    imu = blocks.get("imu0")
-    if not isinstance(imu, dict):
-        return ImuNoise()
-    names = {
-        "gyroscope_noise_density": "gyro_density",
-        "gyroscope_random_walk": "gyro_walk",
-        "accelerometer_noise_density": "accel_density",
-        "accelerometer_random_walk": "accel_walk",
-        "update_rate": "rate_hz",
-        "rate_hz": "rate_hz",
-    }
-    try:
-        return ImuNoise(**{ours: float(imu[key]) for key, ours in names.items() if key in imu})
-    except (TypeError, ValueError):
-        raise ExportError("imu0: noise densities and rates must be numbers") from None

@@ -37,6 +37,10 @@ class RigCamera:
         unobservable: Directions that the motion did not reveal: do not use their values.
         lens_sigma: Standard deviations of fx fy cx cy and the distortion; (): not known.
         calibration_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.
+
+    Raises:
+        ExportError: A number that is not finite, or a focal length of 0 or less: no file that holds such
+            values is a calibration.
     """
 
     name: str
@@ -56,6 +60,24 @@ class RigCamera:
     readout_axis: str = ""
     lens_sigma: tuple[float, ...] = ()
     calibration_covariance: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        numbers = {
+            "rotation": self.R_imu_cam,
+            "position": self.p_imu_cam,
+            "time shift": self.timeshift_cam_imu_s,
+            "intrinsics": self.intrinsics,
+            "distortion": self.distortion,
+            "covariance": () if self.covariance is None else self.covariance,
+            "calibration_covariance": ()
+            if self.calibration_covariance is None
+            else self.calibration_covariance,
+        }
+        for what, values in numbers.items():
+            if not np.isfinite(np.asarray(values, dtype=np.float64)).all():
+                raise ExportError(f"{self.name}: a number of its {what} is not finite")
+        if min(self.intrinsics[:2]) <= 0.0:
+            raise ExportError(f"{self.name}: its focal length must be above 0")
 
     @property
     def T_imu_cam(self) -> FloatArray:

@@ -74,6 +74,61 @@ def test_a_camera_clock_that_is_set_is_followed_by_the_order_of_arrival(step_s):
     assert intake.offset_s("cam0") == pytest.approx(-step_s)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_images_that_wait_for_a_slow_detector_are_no_step_of_the_clock(seed):
+    """A queue that halves itself when full, as `detect.image_queue`: images are late by seconds, then recent.
+
+    Seen live with a detector that took 0.15 s for images at 12.5 Hz: "stamps stepped by +2.3 s", and a
+    converged calibration was lost.
+    """
+    rng = np.random.default_rng(seed)
+    period_s, work_s = 0.08, rng.uniform(0.12, 0.4)
+    queue, limit, free_s, stamps, arrivals = [], 100.0, 0.0, [], []
+    for k in range(2000):
+        now_s = period_s * k
+        queue.append(now_s)
+        while len(queue) > limit and len(queue) > 1:
+            queue, limit = queue[(len(queue) - 1) % 2 :: 2], 0.75 * limit
+        while queue and free_s <= now_s:
+            stamps.append(queue.pop(0))
+            free_s = max(free_s, stamps[-1]) + work_s * rng.uniform(0.5, 1.5)
+            arrivals.append(free_s)
+    late_s = np.subtract(arrivals, stamps)
+    assert late_s.max() > 4.0 and late_s[-20:].max() < 2.0
+    intake = ImageIntake()
+    assert feed(intake, stamps, np.round(arrivals, 2)) == stamps
+    assert intake.offset_s("cam0") == 0.0
+    assert all(e.kind == "image_gap" for e in intake.news())
+
+
+def test_a_clock_that_is_set_while_images_wait_is_followed():
+    t = 0.05 * np.arange(400)
+    late = np.clip(0.5 * (t - 2.0), 0.0, 3.0)
+    for step_s in (30.0, -30.0):
+        intake = ImageIntake()
+        feed(intake, np.where(t < 10.0, t, t + step_s), t + late)
+        assert intake.offset_s("cam0") == pytest.approx(-step_s, abs=1e-9)
+
+
+def test_clocks_that_drift_do_not_hide_a_step():
+    t = 0.05 * np.arange(40_000)
+    stamps = (1.0 - 200e-6) * t + np.where(t < 1900.0, 0.0, 5.0)
+    intake = ImageIntake()
+    feed(intake, stamps, t)
+    assert intake.offset_s("cam0") == pytest.approx(-5.0, abs=0.01)
+
+
+def test_a_clock_that_is_set_while_no_board_is_in_view_is_followed():
+    t = 0.05 * np.arange(200)
+    empty = PointsFrame("cam0", 0, np.zeros(0, np.int64), np.zeros((0, 2)))
+    frames = [empty if 60 <= k < 100 else image() for k in range(200)]
+    intake = ImageIntake()
+    taken = feed(intake, np.where(t < 4.0, t, t - 3600.0), t + 0.02, frames)
+    assert sum(x is None for x in taken) == 4
+    assert intake.offset_s("cam0") == pytest.approx(3600.0)
+    assert next(e.kind for e in intake.news()) == "stamps_stepped"
+
+
 def test_an_imu_that_pauses_is_no_step_of_the_camera():
     t = 0.05 * np.arange(400)
     newest = np.where((t > 5.0) & (t < 15.0), 5.0, t)

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from vical_daemon.results.export import FORMATS, ExportError, Rig, export, rig_from_json
 from vical_daemon.results.export.kalibr import read_camchain
 from vical_daemon.results.export.text import number
+from vical_daemon.results.files import read_known_file, read_rig
 
 POINT_CAM = np.array([0.3, -0.2, 1.7])
 
@@ -92,9 +93,19 @@ def test_kalibr_chain_without_second_extrinsics_is_followed(rig, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"T_cam_imu": [[1, 2], [3, 4]]}, "4x4"),
-        ({"T_cam_imu": (2 * np.eye(4)).tolist()}, "orthonormal"),
-        ({"intrinsics": [1, 2]}, "list of 4"),
+        ({"T_cam_imu": [[1, 2], [3, 4]]}, "expected 4 values, found 2"),
+        ({"T_cam_imu": np.diag([2.0, 2.0, 2.0, 1.0]).tolist()}, "not a rotation"),
+        ({"T_cam_imu": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "not a rotation"),
+        ({"T_cam_imu": [[1, 0, 0, 70], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "the unit is m"),
+        ({"T_cam_imu": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0, 0, 1]]}, "last row"),
+        ({"T_imu_cam0": np.eye(4).tolist()}, "did you mean T_imu_cam"),
+        ({"timeshift_cam_imu": -8121.0}, "below -5; seconds"),
+        ({"timeshift_cam_imu": float("nan")}, "must be a finite number"),
+        ({"intrinsics": [1, 2]}, "expected 4 values, found 2"),
+        ({"intrinsics": [float("nan"), 460.0, 360.0, 240.0]}, "must be a finite number"),
+        ({"intrinsics": [-461.0, 460.0, 360.0, 240.0]}, "must be above 0"),
+        ({"intrinsics": None}, "cam0 has no intrinsics"),
+        ({"distortion_coeffs": None}, "cam0 has no distortion_coeffs"),
         ({"camera_model": "omni"}, "omni"),
         ({"distortion_model": "fov"}, "fov"),
     ],
@@ -106,6 +117,60 @@ def test_kalibr_mistakes_are_named(rig, tmp_path, change, says):
     path.write_text(yaml.safe_dump(document))
     with pytest.raises(ExportError, match=says):
         read_camchain(path)
+
+
+def test_kalibr_lens_without_distortion_and_line_delay(rig, tmp_path):
+    document = yaml.safe_load(files(single(rig), "kalibr")["camchain-imucam.yaml"])
+    document["cam0"] |= {"distortion_model": "none", "distortion_coeffs": [], "line_delay": 2e-5}
+    path = tmp_path / "camchain.yaml"
+    path.write_text(yaml.safe_dump(document))
+    camera = read_camchain(path).cameras["cam0"]
+    assert (camera.distortion_model, camera.distortion) == ("radtan", (0.0,) * 4)
+    assert camera.readout_s == pytest.approx(2e-5 * camera.size[1])
+
+
+@pytest.mark.parametrize(
+    "value", [{"intrinsics": [float("nan"), 460.0, 360.0, 240.0]}, {"timeshift_cam_imu_s": float("inf")}]
+)
+def test_a_result_with_numbers_that_are_not_finite_is_refused(rig, value):
+    document = json.loads(files(single(rig), "json")["calibration.json"])
+    document["cameras"]["cam0"] |= value
+    with pytest.raises(ExportError, match=r"cam0: a number of its .* is not finite"):
+        rig_from_json(document)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("calib.json", '{"value0": {"T_imu_cam": [{"px": 0}], "cam_time_offset_ns": 0}}', "Basalt's"),
+        ("euroc.yaml", '%YAML:1.0\nCamera.type: "PinHole"\nTbc: !!opencv-matrix\n  rows: 4\n', "ORB-SLAM3"),
+        ("vins.yaml", "%YAML:1.0\nimu: 1\nbody_T_cam0: !!opencv-matrix\n   rows: 4\n", "VINS-Fusion"),
+        ("cam0.yaml", "%YAML:1.0\nmodel_type: PINHOLE\ncamera_name: camera\n", "VINS-Fusion's lens"),
+        ("sensor.yaml", "sensor_type: camera\nT_BS:\n  cols: 4\n", "inverse of T_BS"),
+        ("cameras.txt", "# Camera list\n1 OPENCV 752 480 461 460 362 246 0 0 0 0\n", "COLMAP's"),
+        ("cameras.txt", "1 SIMPLE_RADIAL 752 480 461 362 246 0\n", "COLMAP's"),
+        ("rig.urdf", '<?xml version="1.0"?>\n<robot name="rig"/>\n', "URDF"),
+        ("results-imucam.txt", "Calibration results\n===================\n", "give the camchain-imucam.yaml"),
+        ("calib.xml", '<?xml version="1.0"?>\n<opencv_storage>\n', "OpenCV's FileStorage"),
+        ("notes.txt", "fx is 461\n", "not a calibration that vical reads: give a result"),
+    ],
+)
+def test_files_of_other_tools_are_named_with_what_to_try(tmp_path, name, text, says):
+    path = tmp_path / name
+    path.write_text(text)
+    for read in (read_rig, read_known_file):
+        with pytest.raises(ExportError, match=says) as refused:
+            read(path)
+        assert "\n" not in str(refused.value) and str(refused.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name not in ("kalibr", "openvins", "json")])
+def test_our_own_files_for_other_tools_are_named_when_they_come_back(rig, tmp_path, name):
+    for made in export(single(rig), name):
+        path = tmp_path / made.name
+        path.write_text(made.text)
+        with pytest.raises(ExportError, match=r"this is|no transforms in it"):
+            read_rig(path)
 
 
 def test_openvins_reads_camera_to_imu(rig, tmp_path):

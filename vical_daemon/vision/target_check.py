@@ -1,0 +1,202 @@
+"""Says how pictures contradict the target file: other tags, another layout, other counts of corners.
+
+A board that is not the stated one is not found, or worse, found in part. A person then reads that the target
+is not in view. So some pictures are compared with boards near the stated one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from vical_daemon.vision.aprilgrid import search_tags
+from vical_daemon.vision.detection import FloatArray, Gray, IntArray
+from vical_daemon.vision.grid_model import fit_grid
+from vical_daemon.vision.saddle import SaddleImage
+from vical_daemon.vision.target import TAG_FAMILY_SIZE, AprilGrid, Checkerboard, Target
+
+_ANY_TAG = AprilGrid(TAG_FAMILY_SIZE, 1, 1.0, 0.3)
+MIN_TAGS = 6
+"""Tags that a layout is judged by: twelve numbers for eight of a homography, one of a lens and the layout."""
+MAX_MISFIT = 0.03
+"""RMS distance of tags from their places in the right layout, over the edge of a tag. In rendered pictures it
+is at most 0.02, also with a fisheye lens; with a wrong number of columns it is 1 to 3."""
+SPACING_ERROR = 0.01
+"""Difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
+_FIRST, _EVERY, _RARER = 10, 20, 0.25
+"""The first picture that is looked at, and then each after so many more, or after this share of all so far: a
+camera that waits all day for its board takes no time for it."""
+_TAGS_A_TURN = 4  # kinds of tags that one picture is searched for
+_MAX_COLS = 30
+_SPACINGS = np.geomspace(0.02, 2.0, 24)
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+_OTHER_COUNTS = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2))
+_FAMILIES = {
+    "AprilTag 36h11": cv2.aruco.DICT_APRILTAG_36h11,
+    "AprilTag 36h10": cv2.aruco.DICT_APRILTAG_36h10,
+    "AprilTag 25h9": cv2.aruco.DICT_APRILTAG_25h9,
+    "AprilTag 16h5": cv2.aruco.DICT_APRILTAG_16h5,
+    "ArUco 6x6": cv2.aruco.DICT_6X6_250,
+    "ArUco 5x5": cv2.aruco.DICT_5X5_250,
+    "ArUco 4x4": cv2.aruco.DICT_4X4_250,
+}
+_OTHER_TAGS = [
+    (name, border) for border in (1, 2) for name in _FAMILIES if (name, border) != ("AprilTag 36h11", 2)
+]
+
+
+class TargetCheck:
+    """Compares pictures of one camera with the target file, until one fits or two say the same.
+
+    Args:
+        target: As the file states it.
+        tell: Called once, with what two pictures contradict, one line.
+    """
+
+    def __init__(self, target: Target, tell: Callable[[str], None]) -> None:
+        self._target, self._tell = target, tell
+        self._settled = False
+        self._turn = self._taken = 0
+        self._next = _FIRST
+        self._last = ""
+
+    def take(self, gray: Gray, *, found: bool) -> None:
+        """Look at a picture.
+
+        Args:
+            gray: The picture.
+            found: The board was found in it, or what looks like a part of it.
+        """
+        self._settled = self._settled or (
+            found and isinstance(self._target, Checkerboard)
+        )  # found as a whole
+        self._taken += 1
+        if self._settled or self._taken < self._next:
+            return
+        self._next = self._taken + max(_EVERY, round(_RARER * self._taken))
+        text = contradiction(gray, self._target, self._turn)
+        if text is None:
+            self._turn += 1
+            return
+        self._settled = text in ("", self._last)
+        if self._settled and text:
+            self._tell(text)
+        self._last = text
+
+
+def contradiction(gray: Gray, target: Target, turn: int = 0) -> str | None:
+    """Return what in the target file a picture contradicts, "" if it fits, None if it does not tell.
+
+    Args:
+        gray: The picture, uint8.
+        target: As the file states it.
+        turn: Of several other boards that take long to search for, one is tried in its turn.
+    """
+    ids, quads = search_tags(SaddleImage(gray), gray, _ANY_TAG)
+    if isinstance(target, Checkerboard):
+        if len(ids) >= MIN_TAGS:
+            return "AprilTags are in view, the target file states a checkerboard"
+        return _other_counts(gray, target, turn)
+    if len(ids) < MIN_TAGS:
+        return _other_tags(gray, turn)
+    last = target.first_tag + target.tag_cols * target.tag_rows - 1
+    if np.count_nonzero((ids < target.first_tag) | (ids > last)) > 0.5 * len(ids):
+        return (
+            f"other tags than those of the target file ({target.first_tag} to {last}) are in view: "
+            "check codeOffset, tagCols and tagRows"
+        )
+    return _other_layout(ids - target.first_tag, quads, target, (gray.shape[0], gray.shape[1]))
+
+
+def _other_layout(
+    index: IntArray, quads: FloatArray, target: AprilGrid, shape: tuple[int, int]
+) -> str | None:
+    if _misfit_of_rows(index, quads, target.tag_cols, shape) > MAX_MISFIT:
+        others = range(1, _MAX_COLS + 1)
+        fitting = [cols for cols in others if _misfit_of_rows(index, quads, cols, shape) < MAX_MISFIT]
+        if len(fitting) != 1:  # tags of one or two rows fit several
+            return None
+        return f"the tags stand in rows of {fitting[0]}, the target file states tagCols: {target.tag_cols}"
+    spacing = _spacing(index, quads, target.tag_cols, shape)
+    if abs(spacing - target.tag_spacing) > SPACING_ERROR:
+        return (
+            f"the gaps between tags are {spacing:.2f} times as large as the tags, "
+            f"the target file states tagSpacing: {target.tag_spacing:g}"
+        )
+    return ""
+
+
+def _misfit_of_rows(index: IntArray, quads: FloatArray, cols: int, shape: tuple[int, int]) -> float:
+    """RMS distance of the middles of tags from a grid with rows of `cols`, over the edge of a tag."""
+    at = np.stack([index % cols, index // cols], axis=1).astype(np.float64)
+    if cols > 1 and np.ptp(at[:, 0]) == 0.0:
+        return float("inf")
+    middle = _crossing(quads)
+    return _misfit(at, middle, shape) / float(_edges(quads).mean())
+
+
+def _spacing(index: IntArray, quads: FloatArray, cols: int, shape: tuple[int, int]) -> float:
+    """Gap between tags over their size, by the best fit of all corners."""
+    at = np.stack([index % cols, index // cols], axis=1)[:, None]
+    spacings = _SPACINGS
+    for _ in range(3):
+        places = [((1.0 + spacing) * at + _CORNERS).reshape(-1, 2) for spacing in spacings]
+        k = int(np.argmin([_misfit(xy, quads.reshape(-1, 2), shape) for xy in places]))
+        best, low, high = spacings[k], spacings[max(k - 1, 0)], spacings[min(k + 1, len(spacings) - 1)]
+        spacings = np.linspace(low, high, 9)
+    return float(best)
+
+
+def _misfit(xy: FloatArray, uv_px: FloatArray, shape: tuple[int, int]) -> float:
+    """RMS distance of points from a flat board with these coordinates, px."""
+    model = fit_grid(xy, uv_px, shape)
+    if model is None:
+        return float("inf")
+    error = np.linalg.norm(model.predict(xy) - uv_px, axis=1)
+    return float(np.sqrt(np.mean(np.where(np.isfinite(error), error, max(shape)) ** 2)))
+
+
+def _edges(quads: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2))
+
+
+def _crossing(quads: FloatArray) -> FloatArray:
+    """Where the diagonals of quadrilaterals cross, the image of the middle, shape (n, 2)."""
+    p, a, b = quads[:, 0], quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
+    c = quads[:, 1] - p
+    along = (c[:, 0] * b[:, 1] - c[:, 1] * b[:, 0]) / (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return np.asarray(p + along[:, None] * a)
+
+
+def _other_tags(gray: Gray, turn: int) -> str | None:
+    for k in range(_TAGS_A_TURN):
+        name, border = _OTHER_TAGS[(turn * _TAGS_A_TURN + k) % len(_OTHER_TAGS)]
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = border
+        parameters.errorCorrectionRate = 0.0
+        family = cv2.aruco.getPredefinedDictionary(_FAMILIES[name])
+        _, ids, _ = cv2.aruco.ArucoDetector(family, parameters).detectMarkers(gray)
+        if ids is not None and len(np.unique(ids)) >= MIN_TAGS:
+            return (
+                f"tags of the family {name} with a border of {border} bits are in view; vical reads "
+                "AprilTag 36h11 with a border of 2 bits, as Kalibr prints it (`vical target` makes a board)"
+            )
+    return None
+
+
+def _other_counts(gray: Gray, target: Checkerboard, turn: int) -> str | None:
+    from vical_daemon.vision.detector import BoardDetector
+
+    more = _OTHER_COUNTS[turn % len(_OTHER_COUNTS)]
+    cols, rows = target.cols + more[0], target.rows + more[1]
+    if min(cols, rows) < 3:
+        return None
+    if BoardDetector(replace(target, cols=cols, rows=rows), guided=False).detect(gray) is None:
+        return None
+    return (
+        f"a checkerboard with {cols} x {rows} inner corners is in view, the target file states "
+        f"{target.cols} x {target.rows}: count inner corners, one less than squares"
+    )
