@@ -22,7 +22,7 @@ from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prio
 from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
 from vical_mocks.random_rigs import draw
 from vical_mocks.rig import Bump, Rig, reference_rig
-from vical_mocks.rotations import exp_so3
+from vical_mocks.rotations import FloatArray, exp_so3
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 
 from benchmarks import gaps, runner
@@ -37,6 +37,8 @@ LOOK_S = 0.5
 _CLEAN = ("frame_sigma_px", "stamp_jitter_s", "outlier_fraction", "missing_fraction", "frame_drop_fraction")
 _FACTS = {Kind.IMAGE_GAP, Kind.STARTED_ANEW, Kind.WENT_ON}
 _DRIFT = (Kind.CLOCK_DRIFT, Kind.CLOCK_WANDER)
+_BUMP = (Kind.BUMPED, Kind.STARTED_OVER)
+_BOARD = (Kind.POSE_LOST, Kind.NOT_BUMPED)
 _OF_A_BUMP = frozenset({Kind.CAMERA_MOVED, Kind.CAMERA_TURNED, Kind.POSE_LOST})
 
 
@@ -50,11 +52,27 @@ def _matrices(size: float, rig: Rig, rng: np.random.Generator) -> Rig:
     return replace(rig, gyro_matrix=np.eye(3) + 0.5 * (G + G.T), accel_matrix=np.eye(3) + A)
 
 
-def _bumped(rig: Rig, rng: np.random.Generator) -> Rig:
-    """Turned by 2 deg and moved by 10 mm, in random directions."""
+def _random_move(turn_deg: float, move_m: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """A turn, rad, and a move, m, in random directions."""
     turn, move = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    bump = Bump(AT_S, tuple((np.deg2rad(2.0) * turn).tolist()), tuple((0.01 * move).tolist()))
-    return replace(rig, bumps=(bump,))
+    return np.deg2rad(turn_deg) * turn, move_m * move
+
+
+def _bumped(turn_deg: float, move_m: float, rig: Rig, rng: np.random.Generator) -> Rig:
+    """A camera that is knocked."""
+    turn, move = _random_move(turn_deg, move_m, rng)
+    return replace(rig, bumps=(Bump(AT_S, tuple(turn.tolist()), tuple(move.tolist())),))
+
+
+def _zoomed(factor: float, run: SimulatedRun) -> SimulatedRun:
+    """The focal length changes."""
+    middle = np.array(run.rig.lens.intrinsics[2:])
+    return replace(
+        run,
+        frames=[
+            f if f.t_s < AT_S else replace(f, uv_px=middle + factor * (f.uv_px - middle)) for f in run.frames
+        ],
+    )
 
 
 def _apart(ppm: float, from_s: float, rig: Rig, rng: np.random.Generator) -> Rig:  # noqa: ARG001
@@ -89,6 +107,7 @@ class Case:
         lens_off: At values that are not this camera's.
         crooked, size: The board is bent, or as many times as large as in its file.
         board_only: It makes no sense without a board.
+        knocked: By how far the board is turned (deg) and moved (m) at `AT_S`.
         sudden: The calibration changes at `AT_S`; it may take `NOTICED_S` to notice.
     """
 
@@ -102,6 +121,7 @@ class Case:
     crooked: bool = False
     size: float = 1.0
     board_only: bool = False
+    knocked: tuple[float, float] = (0.0, 0.0)
     sudden: bool = False
 
 
@@ -135,7 +155,12 @@ CASES: dict[str, Case] = {
     "clocks 15 ppm apart from 20 s on": _is(*_DRIFT, rig=partial(_apart, 15.0, AT_S), sudden=True),
     "time shift steps by 2 ms": _is(Kind.TIMESHIFT_STEPPED, Kind.CLOCK_WANDER, rig=_stepped, sudden=True),
     "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(gaps.cut, "imu", 0.5)),
-    "bump": _is(Kind.BUMPED, Kind.STARTED_OVER, also=_OF_A_BUMP, rig=_bumped, sudden=True),
+    "bump": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 2.0, 0.01), sudden=True),
+    "camera moved by 5 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.005), sudden=True),
+    "camera moved by 3 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.003), sudden=True),
+    "lens zoomed by 1 %": _is(Kind.LENS_STEPPED, after=partial(_zoomed, 1.01), sudden=True, board_only=True),
+    "board moved by 20 mm": _is(*_BOARD, knocked=(0.0, 0.02), board_only=True, sudden=True),
+    "board moved by 200 mm and 20 deg": _is(*_BOARD, knocked=(20.0, 0.2), board_only=True, sudden=True),
 }
 
 
@@ -156,7 +181,16 @@ def make_run(case: Case, seed: int, seconds: float, *, zoo: bool, target_free: b
     if target_free:
         return case.after(simulate_tracks(seed, seconds, rig=rig, landmarks_m=points, **simulation))
     true = case.size * (crooked_board(seed, points) if case.crooked else points)
-    return replace(case.after(simulate(seed, seconds, rig=rig, points_m=true, **simulation)), points_m=points)
+    run = simulate(seed, seconds, rig=rig, points_m=true, **simulation)
+    if any(case.knocked):
+        turn, move = _random_move(*case.knocked, rng)
+        middle = true.mean(axis=0)
+        moved = simulate(
+            seed, seconds, rig=rig, points_m=(true - middle) @ exp_so3(turn).T + middle + move, **simulation
+        )
+        frames = [f for f in run.frames if f.t_s < AT_S] + [f for f in moved.frames if f.t_s >= AT_S]
+        run = replace(run, frames=frames)
+    return replace(case.after(run), points_m=points)
 
 
 def trial(name: str, seconds: float, zoo: bool, target_free: bool, seed: int) -> runner.Result:

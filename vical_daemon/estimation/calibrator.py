@@ -39,11 +39,10 @@ from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import BEFORE_S, RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
-from vical_daemon.estimation.status.what_jumped import Part, lens_stepped, what_jumped
+from vical_daemon.estimation.status.what_jumped import MOVED, Part, lens_stepped, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
-_PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 
 
@@ -81,7 +80,7 @@ class Calibrator:
         self._past = RecentPast()
         # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
         self._unproven: tuple[float, str, float] | None = None
-        self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
+        self._sure_from_s = -np.inf  # from then on, what jumped is known for sure
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
 
@@ -204,9 +203,6 @@ class Calibrator:
         """Go on from a start: use its images, and then the stream."""
         later = self._pending.take_all()
         f.stamp_sigma_s = self._intake.stamp_sigma_s
-        if self._stale is not None and self._stale.layout is self.rig.layout:
-            f.keep_from(self._stale)
-            self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
         self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
         self.evaluator.started(f.state.t_s, found.reason)
@@ -256,9 +252,10 @@ class Calibrator:
                 reports += self._find_motion(self._lost, item[1], item[0])
         return reports
 
-    def _lose_motion(self) -> None:
+    def _lose_motion(self, *, jumped: bool = False) -> None:
         """Forget where the rig is, not its calibration; images to come will show it."""
-        self._lost, self._held_back = MotionRestart(self.rig.target, self._used_ns), HoldoutCheck()
+        self._lost = MotionRestart(self.rig.target, self._used_ns, jumped=jumped)
+        self._held_back = HoldoutCheck()
 
     def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
         """Take the motion anew as soon as images show it, and follow those it was taken from."""
@@ -275,6 +272,8 @@ class Calibrator:
         if motion is None:
             return []
         self._lost = None
+        if motion.turned is not None:  # copies from before know of no target that moved
+            self._past = RecentPast()
         f.restart_motion(motion)
         self.watch.motion_restarted(motion.t_s)
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
@@ -324,7 +323,7 @@ class Calibrator:
             (_, camera, before_s), self._unproven = self._unproven, None
             step_s = f.state.cameras[camera].timeshift_s - before_s
             self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
-        if f.unobservable is None:  # see `StatusEvaluator.saw_frame`
+        if f.unobservable is None and not self.watch.undecided:  # see `StatusEvaluator.saw_frame`
             for block, event in self._acceptance.look(f).items():
                 self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
@@ -349,10 +348,10 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action in (Action.POSE, Action.RESTART) and self._part_changed(f, frame.camera):
+        if action in (Action.ASK, Action.POSE, Action.RESTART) and self._part_changed(f, frame.camera):
             return
         if action is Action.POSE:
-            self._lose_motion()
+            self._lose_motion(jumped=True)
             if f.unobservable is None:
                 self.evaluator.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER) and f.unobservable is None:
@@ -363,14 +362,13 @@ class Calibrator:
             self._restart(f)
 
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images disagree because of a camera's clock or lens; go on with that alone unknown."""
+        """See whether images no longer fit because something jumped; go on with that alone unknown."""
         assert self._buffer is not None
-        if self.rig.layout.cameras[camera].timeshift is None or f.unobservable is not None:
+        if f.unobservable is not None or f.state.t_s < self._sure_from_s:
             return False
-        before = self._past.filter(f)  # images since have moved the present one, above all its lens
-        if self._unproven is not None:
-            return self._part_jumped(before, camera)
-        fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
+        before, fit = self._past.filter(f), None  # images since have moved the present one
+        if self._unproven is None and self.rig.layout.cameras[camera].timeshift is not None:
+            fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera)
         self.filter = before
@@ -382,20 +380,26 @@ class Calibrator:
         return True
 
     def _part_jumped(self, before: CalibrationFilter, camera: str) -> bool:
-        """See whether a step that orientations do not show, another rate or lens explains the images best."""
-        part, f = what_jumped(before, self._past.since(before), camera, self._step)
-        if part in (Part.NONE, Part.MOUNTING) or (self._unproven is not None and part is not Part.LENS):
+        """See which jump explains the images best, of those that orientations do not show."""
+        found = what_jumped(before, self._past.since(before), camera, self._step)
+        part, f = found.part, found.filter
+        if part is Part.NONE or (self._unproven is not None and part in (Part.SHIFT, Part.DRIFT)):
             return False
-        self.filter = f
-        if part is Part.DRIFT:
+        self.filter, self._unproven = f, None
+        self._sure_from_s = f.state.t_s + BEFORE_S
+        self.evaluator.jumped(f.state.t_s)
+        if found.possible & MOVED:
+            self.evaluator.may_have_moved(before, self.watch.why, sure=found.possible <= MOVED)
+        elif part is Part.TARGET:
+            self._lose_motion(jumped=True)
+            self.evaluator.announce(Event(EventKind.POSE_LOST))
+        elif part is Part.DRIFT:
             self.evaluator.announce(clock_drift.let_drift(f, camera, anew=True), once=f"wander {camera}")
         elif part is Part.LENS:
-            self._unproven = None
             self.evaluator.announce(lens_stepped(before, f, camera))
         else:
             self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self.watch.shift_reopened()
-        self.evaluator.reopened(f.state.t_s)
         return True
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> None:
@@ -408,16 +412,13 @@ class Calibrator:
         self.evaluator.reopened(f.state.t_s)
 
     def _restart(self, f: CalibrationFilter) -> None:
-        """The rig has changed: find mounting and delay anew in the data to come, and keep all else.
-
-        Where what was kept soon turns out not to fit either, nothing is.
-        """
+        """Images fit nothing that is known: find everything anew in the data to come."""
         if f.unobservable is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._initializer.anew()
             return
         before = self._past.filter(f)
-        sound = before if before.finite() and f.state.t_s > self._kept_until_s else None
+        sound = before if before.finite() else None
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
         self._unproven = None

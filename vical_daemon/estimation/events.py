@@ -172,22 +172,25 @@ class About(NamedTuple):
 
 REFERENCE: dict[EventKind, About] = {
     EventKind.BUMPED: About(
-        "The rig has changed since it was calibrated; calibration starts over.",
+        "The rig has changed since it was calibrated; the mounting is found again.",
         "",
-        "After the first convergence, when images stop fitting the motion although pose and time shift were "
-        "estimated again. Target-free: when 2 s of images show another mounting.",
+        "After the first convergence, when images stop fitting the motion and only another mounting explains "
+        "them, or nothing does. Target-free: when 2 s of images show another mounting.",
     ),
     EventKind.STARTED_OVER: About(
         "As `bumped`, but there was no converged calibration yet.", "", "Before the first convergence."
     ),
     EventKind.STARTED_ANEW: About(
-        "There is a calibration again.", "", "At the first solution after `bumped` or `started_over`."
+        "There is a calibration again.",
+        "",
+        "At the first solution after `bumped` or `started_over`, if calibration had to start over.",
     ),
     EventKind.NOT_BUMPED: About(
-        "Mounting and time shift show no change since before `bumped`. The target was moved, or images were "
-        "wrong. Value: the least move of the camera that would show.",
+        "Images disagreed, but mounting, time shift and lens have not changed. The target was moved, or "
+        "images were wrong. Value: the least move of the camera that would show.",
         "m",
-        "With a target: at the next convergence after `bumped`, if nothing differs as for `camera_moved`.",
+        "With a target: at the latest 10 s after `bumped`, or after images that a moved camera and a moved "
+        "target explain equally well, once converged, if nothing differs as for `camera_moved`.",
     ),
     EventKind.WENT_ON: About(
         "Target-free: images are used again; the calibration was kept.", "", "When a pause ends."
@@ -232,13 +235,14 @@ REFERENCE: dict[EventKind, About] = {
         "The lens changed at once: focus or zoom was turned, or focuses by itself. It is estimated again; "
         "everything else is kept. Value: focal length fx, new minus old.",
         "px",
-        "With a board and a lens that is not fixed: when images no longer fit, and another lens explains "
-        "them far better than a bump.",
+        "With a board and a lens that is not fixed: when images no longer fit and only another lens explains "
+        "them, or when fx differs by 4 joint sigma and 1 px afterwards.",
     ),
     EventKind.POSE_LOST: About(
-        "The pose was lost and is taken from the images again; the calibration is kept.",
+        "The target was moved, or the pose was lost. It is found again; the calibration is kept.",
         "",
-        "After 10 images in a row that do not fit.",
+        "When images no longer fit and a moved target explains them, or after 10 images in a row that "
+        "nothing explains.",
     ),
     EventKind.CLOCK_DRIFT: About(
         "The clocks of camera and IMU run at different rates; the drift is estimated from now "

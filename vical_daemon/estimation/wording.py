@@ -239,7 +239,7 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.BUMPED: lambda _: "since before the bump",
     Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even after the pose was re-initialised",
     Cause.IMAGES_DISAGREE: lambda _: (
-        "images and motion disagree by more than before: the camera or the target moved"
+        "images and motion disagree by more than before: the camera or the target moved, or the lens changed"
     ),
     Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate is not finite",
     Cause.CALIBRATION_CONTRADICTED: lambda _: (
@@ -326,7 +326,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.NOT_BUMPED: (
         "",
         lambda e: (
-            "no change since before the bump: the target was moved, or images were wrong "
+            "the mounting has not changed: the target was moved, or images were wrong "
             f"(a camera that moved by more than {_of(e, 1e3, 'mm', '.1f')} would show)"
         ),
     ),
@@ -354,7 +354,10 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
             "it is estimated again, all else is kept"
         ),
     ),
-    EventKind.POSE_LOST: ("", lambda _: "pose lost, and re-initialised from the images"),
+    EventKind.POSE_LOST: (
+        "",
+        lambda _: "the target was moved, or the pose was lost: it is found again, the calibration is kept",
+    ),
     EventKind.CLOCK_DRIFT: (
         "",
         _drift("the time shift drifts: the clocks of camera and IMU run at different rates"),

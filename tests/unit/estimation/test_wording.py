@@ -44,7 +44,8 @@ def test_every_cause_has_a_text(cause):
     [
         (
             Event(EventKind.BUMPED, "cam0", cause=Cause.IMAGES_DISAGREE),
-            "bumped: cam0: images and motion disagree by more than before: the camera or the target moved",
+            "bumped: cam0: images and motion disagree by more than before: the camera or the target moved, "
+            "or the lens changed",
         ),
         (
             Event(EventKind.TIMESHIFT_STEPPED, "cam0", 0.0201),

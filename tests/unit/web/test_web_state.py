@@ -274,7 +274,7 @@ def test_announcements_stay_on_the_page_for_a_while(bus, state, web_feed):
         web_feed.publish_estimate(bus, web_feed.estimate(1.2 + k, rng))
     shown = state.tick()["cameras"]["cam0"]["events"]
     assert [event["t_s"] for event in shown] == [float(k) for k in range(3, EVENTS + 3)]
-    assert shown[0]["kind"] == "pose_lost" and shown[0]["text"].startswith("cam0: pose lost")
+    assert shown[0]["kind"] == "pose_lost" and shown[0]["text"].startswith("cam0: the target was moved")
     web_feed.publish_estimate(bus, web_feed.estimate(0.5, rng))  # begun anew
     assert state.tick()["cameras"]["cam0"]["events"] == []
 

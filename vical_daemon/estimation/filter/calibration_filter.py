@@ -50,7 +50,6 @@ from vical_daemon.estimation.model.state import (
     ATTITUDE,
     GRAVITY,
     GYRO_BIAS,
-    MOTION,
     Layout,
     MotionStart,
     State,
@@ -386,6 +385,10 @@ class CalibrationFilter:
             sigmas = np.concatenate(
                 [sigmas, np.repeat([b.gyro_bias_sigma, b.accel_bias_sigma, b.gravity_sigma], (3, 3, 2))]
             )
+        if motion.turned is not None:
+            state.gravity, state.tilt = motion.turned @ state.gravity, motion.turned @ state.tilt
+            turned_rad = float(np.linalg.norm(so3.log(motion.turned)))
+            self.inflate_covariance(turned_rad * np.eye(self.layout.size)[:, GRAVITY])  # or it is the imu
         new = len(sigmas)  # motion, or all up to gravity
         A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, new))], axis=1)
         self._drift_shifts(A, dt)
@@ -415,53 +418,6 @@ class CalibrationFilter:
             if where.timeshift is not None and where.skew is not None:
                 A[where.timeshift, :n] += dt * self.S[where.skew]
                 self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
-
-    def keep_from(self, known: CalibrationFilter) -> None:
-        """After a change of the mounting: take all from an earlier filter but what the change may have moved.
-
-        Found again, and left as they are here, are motion, gravity in the target's frame, mountings, lever
-        arms and time shifts.
-
-        Args:
-            known: A filter of the same layout.
-        """
-        anew: list[slice] = [MOTION, GRAVITY]
-        for where in self.layout.cameras.values():
-            anew += [s for s in (where.position, where.rotation) if s is not None]
-            anew += [] if where.timeshift is None else [slice(where.timeshift, where.timeshift + 1)]
-        kept = np.ones(self.layout.size, dtype=bool)
-        for block in anew:
-            kept[block] = False
-        elapsed_s = max(self.state.t_s - known.state.t_s, 0.0)
-        old = np.concatenate([known.S, known._random_walk(elapsed_s)], axis=1)
-        rows = kept[:, None]
-        self.S = unscented.lower_root(
-            np.concatenate([np.where(rows, old, 0.0), np.where(rows, 0.0, self.S)], axis=1)
-        )
-        here, there = self.state, known.state
-        self.state = replace(
-            there,
-            t_s=here.t_s,
-            R_world_imu=here.R_world_imu,
-            p_world_imu=here.p_world_imu,
-            v_world_imu=here.v_world_imu,
-            gravity=here.gravity,
-            tilt=here.tilt,
-            cameras={
-                name: replace(
-                    camera,
-                    R_imu_cam=here.cameras[name].R_imu_cam,
-                    p_imu_cam=here.cameras[name].p_imu_cam,
-                    timeshift_s=here.cameras[name].timeshift_s,
-                )
-                for name, camera in there.cameras.items()
-            },
-        )
-        self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
-        self.agreement, self.walk, self.wandered = known.agreement, known.walk, known.wandered
-        self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
-        for consistency in self.consistency.values():
-            consistency.settle()
 
     def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
         """A filter that can be run ahead of this one; what is measured about the noise stays shared.

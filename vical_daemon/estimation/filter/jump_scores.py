@@ -9,11 +9,11 @@ linear systems", 1976]
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import solve_lower, unit
 
 
@@ -22,31 +22,27 @@ class JumpScores:
     """What the images of a run say about jumps just before each of them.
 
     Attributes:
-        errors: Indices of the errors that may jump, shape (p,).
-        D: By each instant and error, shape (n, k p).
+        D: Jumps of one sigma as they are now, by each instant and direction, shape (n, k p).
         information: Of each instant, shape (k, p, p).
         weighted: That times the jump, shape (k, p).
     """
 
-    errors: IntArray
     D: FloatArray
-    information: FloatArray = field(init=False)
-    weighted: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        p = len(self.errors)
-        self.information, self.weighted = np.zeros((0, p, p)), np.zeros((0, p))
+    information: FloatArray
+    weighted: FloatArray
 
     @classmethod
-    def of(cls, errors: IntArray, size: int) -> JumpScores:
-        """Of a filter with `size` errors."""
-        return cls(errors, np.zeros((size, 0)))
+    def of(cls, size: int, p: int) -> JumpScores:
+        """Of a filter with `size` errors, and jumps in `p` directions."""
+        return cls(np.zeros((size, 0)), np.zeros((0, p, p)), np.zeros((0, p)))
 
-    def begin(self) -> None:
-        """The next image may be the first after a jump."""
-        p = len(self.errors)
-        columns = np.zeros((len(self.D), p))
-        columns[self.errors, np.arange(p)] = 1.0
+    def begin(self, columns: FloatArray) -> None:
+        """The next image may be the first after a jump.
+
+        Args:
+            columns: Directions of the errors, each as long as one sigma of a jump, shape (n, p).
+        """
+        p = columns.shape[1]
         self.D = np.concatenate([self.D, columns], axis=1)
         self.information = np.concatenate([self.information, np.zeros((1, p, p))])
         self.weighted = np.concatenate([self.weighted, np.zeros((1, p))])
@@ -90,14 +86,28 @@ class JumpScores:
         self.information += np.swapaxes(by_instant, 1, 2) @ np.swapaxes(JG.reshape(len(G), k, p), 0, 1)
         self.D -= S @ (moves[:, : len(S)].T @ JG)
 
-    def log_ratios(self, part: slice, sigma: FloatArray) -> FloatArray:
-        """Logarithm of the likelihood of a jump of some errors over that of none, shape (k,).
+    def log_ratios(self, part: slice) -> FloatArray:
+        """Logarithm of the likelihood of a jump in some directions over that of none, shape (k,).
 
         Args:
-            part: Which of `errors`.
-            sigma: By how much they jump, one sigma before the images, shape (q,).
+            part: Which of the directions.
         """
-        A = sigma[:, None] * self.information[:, part, part] * sigma + unit(len(sigma))
-        b = self.weighted[:, part] * sigma
+        A, b = self._posterior(part)
         explained = np.vecdot(b, np.linalg.solve(A, b[..., None])[..., 0])
         return np.asarray(0.5 * (explained - np.linalg.slogdet(A)[1]))
+
+    def sizes(self, part: slice, instant: int) -> FloatArray:
+        """By how much some directions jumped: root of the expected square, over one sigma, shape (q,).
+
+        Args:
+            part: Which of the directions.
+            instant: Index of the image after the jump.
+        """
+        A, b = (x[instant] for x in self._posterior(part))
+        covariance = np.linalg.inv(A)
+        return np.asarray(np.sqrt((covariance @ b) ** 2 + np.diag(covariance)))
+
+    def _posterior(self, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Information, shape (k, q, q), and information vectors, shape (k, q), of a jump of one sigma."""
+        b = self.weighted[:, part]
+        return self.information[:, part, part] + unit(b.shape[1]), b

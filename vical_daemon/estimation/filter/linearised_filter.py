@@ -103,15 +103,6 @@ class LinearisedFilter(CalibrationFilter):
         known = {x.name: getattr(self, x.name) for x in fields(CalibrationFilter)}
         return CalibrationFilter(**known | {"state": self.mean})
 
-    def keep_from(self, known: CalibrationFilter) -> None:
-        """See `CalibrationFilter.keep_from`; the reference stays."""
-        plain = self.plain()
-        plain.keep_from(known)
-        for x in fields(CalibrationFilter):
-            if x.name != "state":
-                setattr(self, x.name, getattr(plain, x.name))
-        self.offset = difference(plain.state, self.state, self.layout)
-
     def predict(self, segment: ImuSegment) -> None:
         """Propagate to the end of a segment; the reference goes on from its own instant where it has one."""
         state, d = self.state, self.layout.dynamic

@@ -62,10 +62,11 @@ class MotionRestart:
     Args:
         target: Points of the target, m, shape (n, 3).
         before_ns: Stamp of the last image used before, by camera, ns.
+        jumped: Images stopped to fit without a gap: the target may have moved.
     """
 
-    def __init__(self, target: FloatArray, before_ns: Mapping[str, int]) -> None:
-        self._target = target
+    def __init__(self, target: FloatArray, before_ns: Mapping[str, int], *, jumped: bool = False) -> None:
+        self._target, self._jumped = target, jumped
         self._before_ns = dict(before_ns)
         self.frames: Frames = []
         self._seen: list[TargetPose | None] = []
@@ -120,7 +121,8 @@ class MotionRestart:
         start = linear_start(found, poses.p, np.ones(len(t_s)), unknown=[SPEED], known=known)
         wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
         elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)
-        return MotionStart(float(t_s[0]), R[0], start.p_world_cam, start.v_world_imu, wide, elapsed_s)
+        motion = MotionStart(float(t_s[0]), R[0], start.p_world_cam, start.v_world_imu, wide, elapsed_s)
+        return motion._replace(turned=_turned(motion, f, buffer)) if self._jumped else motion
 
     def _begins_well(self, f: CalibrationFilter) -> bool:
         """Begin with an image that shows the pose; False: none does so far, and better ones may come."""
@@ -147,6 +149,16 @@ class MotionRestart:
         before_ns = self._before_ns.get(frame.camera)
         by_camera_s = np.inf if before_ns is None else 1e-9 * (frame.t_cam_ns - before_ns)
         return max(min(by_imu_s, by_camera_s), 0.0)
+
+
+def _turned(motion: MotionStart, f: CalibrationFilter, buffer: ImuBuffer) -> FloatArray | None:
+    """How attitudes by images differ from those by the imu since the motion was lost, shape (3, 3)."""
+    segment = buffer.segment(f.state.t_s, motion.t_s)
+    if segment is None:
+        return None
+    ahead = f.copy()
+    ahead.predict(segment)
+    return np.asarray(motion.R_world_imu @ ahead.state.R_world_imu.T)
 
 
 def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> FloatArray:

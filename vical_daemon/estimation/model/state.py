@@ -283,6 +283,7 @@ class MotionStart(NamedTuple):
         sigmas: Of attitude (rad), position (m), velocity (m/s), shape (9,).
         elapsed_s: Since the state's instant; stamps may have stepped.
         biases: At the beginning of another recording; None: biases and gravity are those of before.
+        turned: How the target seems to have turned against gravity, shape (3, 3); None: it has not moved.
     """
 
     t_s: float
@@ -292,6 +293,7 @@ class MotionStart(NamedTuple):
     sigmas: FloatArray
     elapsed_s: float
     biases: BiasStart | None = None
+    turned: FloatArray | None = None
 
 
 def rotation_from_grp(p: FloatArray) -> FloatArray:

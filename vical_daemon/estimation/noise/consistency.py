@@ -45,6 +45,7 @@ _DEAD_BAND = 1.3
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6
 _CUSUM_LIMIT = 9.0
+_MOST = 5.0  # that one image counts
 
 
 def modes(uv: FloatArray) -> FloatArray:
@@ -124,7 +125,8 @@ class Consistency:
         scale: Multiplies the variance of the corners, >= 1.
         factor: Multiplies the reported covariance, >= 1.
         images: Images taken in.
-        alarm: Cumulated excess of the innovations over their usual level; above `alarm_at` the rig changed.
+        alarm: Cumulated excess of the innovations over their usual level; see `alarmed`.
+        suspicion: Likewise, with images that were refused; see `suspicious`.
     """
 
     memory: float = 800.0
@@ -132,6 +134,7 @@ class Consistency:
     factor: float = 1.0
     images: int = 0
     alarm: float = 0.0
+    suspicion: float = 0.0
     _level: float = 1.0
     _skip: int = _SETTLE
     _weight: float = 0.0
@@ -142,7 +145,7 @@ class Consistency:
 
     def settle(self) -> None:
         """A filter restarts with what was learnt: its first images are not counted."""
-        self._skip, self.alarm = _SETTLE, 0.0
+        self._skip, self.alarm, self.suspicion = _SETTLE, 0.0, 0.0
         self._interrupt()
 
     def _interrupt(self) -> None:
@@ -155,7 +158,21 @@ class Consistency:
 
         Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
-        return self.alarm > _CUSUM_LIMIT * self.factor * math.sqrt(self.scale)
+        return self.alarm > _CUSUM_LIMIT * self.strictness
+
+    @property
+    def suspicious(self) -> bool:
+        """The innovations may have jumped: half of that, images that were refused counted."""
+        return self.suspicion > 0.5 * _CUSUM_LIMIT * self.strictness
+
+    @property
+    def strictness(self) -> float:
+        """By how much evidence must exceed what it would have to be if images were as they are modelled."""
+        return self.factor * math.sqrt(self.scale)
+
+    def refused(self) -> None:
+        """An image was too far off to be used."""
+        self.suspicion += _MOST - _CUSUM_DRIFT
 
     @property
     def fits(self) -> bool:
@@ -199,7 +216,8 @@ class Consistency:
         ratio = float(normal @ normal) / len(normal)
         # One-sided CUSUM: at the usual level it drifts down by 0.6 an image; the chance that eight
         # degrees of freedom drive it to 9 is below 1e-10 an image.
-        self.alarm = max(0.0, self.alarm + min(ratio / self.level, 5.0) - _CUSUM_DRIFT)
+        excess = min(ratio / self.level, _MOST) - _CUSUM_DRIFT
+        self.alarm, self.suspicion = max(0.0, self.alarm + excess), max(0.0, self.suspicion + excess)
         self._move_scale(ratio)
         if len(normal) == MODES:
             self._remember(t_s, normal)

@@ -1,9 +1,9 @@
 """Decides when the rig has changed, and what to do about it.
 
 A strong jump makes images unusable (they are refused); a weaker one raises the innovations (CUSUM in
-`Consistency`); a time shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). A
-lost pose looks like a jump, too, so the pose is found again first; only if images still do not fit is the
-calibration itself in doubt.
+`Consistency`); a time shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). At
+the first signs it is asked what has jumped (`what_jumped`). If nothing explains the images, the pose is found
+again; only if they still do not fit, calibration starts over.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import SURE
+from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.selection.clock_drift import apart, stamps_variance
 from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.status.recent_past import BEFORE_S
 
 _SPAN = 20
 
@@ -80,6 +82,7 @@ class Action(Enum):
     """What is to be done after an image."""
 
     NONE = auto()
+    ASK = auto()
     POSE = auto()
     RESTART = auto()
     SKEW = auto()
@@ -95,24 +98,31 @@ class ChangeWatch:
     """
 
     why: Cause = Cause.NONE
-    _refused: int = 0
+    _refused: dict[str, int] = field(default_factory=dict)  # in a row, by camera
     _closer: int = 0  # images until what has changed is decided; 0: nothing has
+    _suspected: int = 0  # images since something may have changed; 0: nothing may
+    _suspected_s: float = float("-inf")
+    _ask_at: int = 0
     _pose_taken_s: float = float("-inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
 
     def started(self) -> None:
         """A filter starts."""
-        self._refused = self._closer = 0
+        self._refused.clear()
+        self._closer = self._suspected = 0
         self._pose_taken_s = float("-inf")
         self._drift.clear()
 
     def motion_restarted(self, t_s: float) -> None:
         """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
-        self._refused, self._pose_taken_s = 0, t_s
+        self._refused.clear()
+        self._closer = self._suspected = 0
+        self._pose_taken_s = t_s
 
     def shift_reopened(self) -> None:
         """A time shift is to be found again: what is known of its drift no longer holds."""
-        self._refused = self._closer = 0
+        self._refused.clear()
+        self._closer = self._suspected = 0
         self._drift.clear()
 
     @property
@@ -120,19 +130,27 @@ class ChangeWatch:
         """A time shift may be drifting: too early to say so, too likely to ignore."""
         return any(w.doubtful for w in self._drift.values())
 
+    @property
+    def undecided(self) -> bool:
+        """Something may have changed: what, is not known yet."""
+        return bool(self._closer or any(self._refused.values()) or self._suspected)
+
     def look(self, report: FrameReport, f: CalibrationFilter) -> Action:
         """Say what is to be done after this image."""
         t = f.state.t_s
-        self._refused = 0 if report.used else self._refused + 1
+        refused = self._refused.get(report.camera, 0) + 1
+        self._refused[report.camera] = 0 if report.used else refused
+        consistency = f.consistency[report.camera]
+        if not report.used:
+            consistency.refused()
         soon = t < self._pose_taken_s + _SOON_S
-        if self._refused >= _IMAGES:
-            self._refused = 0
+        if not report.used and refused >= _IMAGES:
+            self._refused[report.camera] = 0
             self.why = Cause.IMAGES_REFUSED
             if soon:
                 return Action.RESTART
             self._pose_taken_s = t
             return Action.POSE
-        consistency = f.consistency[report.camera]
         if consistency.alarmed:
             consistency.alarm = 0.0
             if not self._closer:
@@ -142,9 +160,26 @@ class ChangeWatch:
             if not self._closer:
                 self.why = Cause.IMAGES_DISAGREE
                 return Action.RESTART
-        if self._closer or self._refused:  # something has changed: what, is not known yet
+        if self._asks(consistency, t):
+            return Action.ASK
+        if self.undecided:
             return Action.NONE
         return self._look_for_drift(report.camera, f)
+
+    def _asks(self, consistency: Consistency, t_s: float) -> bool:
+        """Whether to see now if something has changed: after 10 images since it may have, 20, 40 ..."""
+        if t_s > self._suspected_s + BEFORE_S:
+            self._suspected = 0
+        if not self._suspected and consistency.suspicious:
+            self._suspected_s, consistency.suspicion = t_s, 0.0
+            self._ask_at = _IMAGES
+        elif not self._suspected:
+            return False
+        self._suspected += 1
+        if self._suspected < self._ask_at:
+            return False
+        self._ask_at, self.why = 2 * self._ask_at, Cause.IMAGES_DISAGREE
+        return True
 
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
         """See once a second whether the clocks run apart, or a drift is not what it was."""

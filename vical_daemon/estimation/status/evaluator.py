@@ -135,10 +135,15 @@ class Evaluator:
 
     def _change(self, why: Cause, status: Status, camera: str = "") -> None:
         """The rig has changed: the calibration is found again."""
-        self.bumped, self.believed, self._started_s = why, False, None
+        self.bumped, self._started_s = why, None
+        self.announce_change(why, camera)
+        self._steady.reset(status)
+
+    def announce_change(self, why: Cause, camera: str = "") -> None:
+        """Announce that the rig has changed."""
+        self.believed = False
         kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
         self.announce(Event(kind, camera, cause=why))
-        self._steady.reset(status)
 
     def _after_change(self, camera: str = "") -> None:
         """There is a calibration: if another one was given up, that is over."""

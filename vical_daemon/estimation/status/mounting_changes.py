@@ -1,4 +1,4 @@
-"""Whether the mounting of a camera, or its time shift, is another than in an earlier estimate."""
+"""Whether the mounting of a camera, its time shift or its lens is another than in an earlier estimate."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import CameraEstimate
 
 _SIGMAS = 4.0
-_IRRELEVANT_M, _IRRELEVANT_RAD, _IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
+IRRELEVANT_M, _IRRELEVANT_RAD, _IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 """Smaller changes are not announced, however significant: thermal play of a mount."""
+IRRELEVANT_PX = 1.0  # likewise of fx: 1 px at the edge of an image 90 deg wide
 
 
 def differences(
     camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float, cause: Cause
 ) -> list[Event]:
-    """Return the significant differences of a mounting from an earlier one, above the `_IRRELEVANT_` limits.
+    """Return the significant differences of a mounting from an earlier one that are not irrelevant.
 
     Compares each component with the sum of both variances, and rotations as the angle about each axis.
 
@@ -38,7 +39,7 @@ def differences(
     turn_rad = so3.log(R_old.T @ R_new)
     shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
     found: list[tuple[EventKind, float, float]] = []
-    if np.any(np.abs(move_m) > np.maximum(limit[:3], _IRRELEVANT_M)):
+    if np.any(np.abs(move_m) > np.maximum(limit[:3], IRRELEVANT_M)):
         found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
     if np.any(np.abs(turn_rad) > np.maximum(limit[3:], _IRRELEVANT_RAD)):
         found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
@@ -48,12 +49,19 @@ def differences(
     return [Event(kind, camera, value, sigma, t_s, cause) for kind, value, sigma in found]
 
 
+def lens_difference(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:
+    """Return the significant difference of the focal length fx, of 1 px and more; arguments as above."""
+    step_px = now.intrinsics[0] - before.intrinsics[0]
+    sigma_px = math.hypot(now.intrinsics_sigma[0], before.intrinsics_sigma[0])
+    if abs(step_px) <= max(_SIGMAS * sigma_px, IRRELEVANT_PX):
+        return []
+    return [Event(EventKind.LENS_STEPPED, camera, step_px, sigma_px, t_s)]
+
+
 def visible_move_m(before: CameraEstimate, now: CameraEstimate) -> float:
     """Return the least move of a camera, in any direction, that `differences` reports, m."""
     covariance = np.asarray(before.T_imu_cam.covariance) + np.asarray(now.T_imu_cam.covariance)
-    return max(
-        _IRRELEVANT_M, _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
-    )
+    return max(IRRELEVANT_M, _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0)))
 
 
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:

@@ -22,7 +22,13 @@ from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict,
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
-from vical_daemon.estimation.status.mounting_changes import differences, visible_move_m
+from vical_daemon.estimation.status.mounting_changes import (
+    IRRELEVANT_M,
+    IRRELEVANT_PX,
+    differences,
+    lens_difference,
+    visible_move_m,
+)
 from vical_daemon.estimation.status.steady_status import Verdict
 from vical_daemon.estimation.wording import not_in_view
 
@@ -55,7 +61,8 @@ class StatusEvaluator(Evaluator):
         self.held_out: deque[HeldOutCheck] = deque(maxlen=_KEPT_CHECKS)
         self._residuals: dict[str, deque[tuple[float, int]]] = {}
         self._cover = Cover()
-        self._before: dict[str, CameraEstimate] = {}  # from before a bump, until it is known what changed
+        self._before: dict[str, CameraEstimate] = {}  # from before a change, until it is known what changed
+        self._named = True  # that a mounting changed has been announced
 
     # ------------------------------------------------------------------ what happens
     def started(self, t_s: float, partial: str = "") -> None:
@@ -72,8 +79,30 @@ class StatusEvaluator(Evaluator):
         self._reopened_s = t_s
         self._steady.reset(min(self.status, Status.CONVERGING, key=list(Status).index))
 
+    def jumped(self, t_s: float) -> None:
+        """Something has changed at `t_s`, and the filter allows for it."""
+        self._recent_used.clear()
+        self._squares.clear()
+        self._held_back.clear()
+        self.reopened(t_s)
+
+    def may_have_moved(self, before: CalibrationFilter, why: Cause, *, sure: bool) -> None:
+        """A mounting may have changed, and the filter allows for it.
+
+        Args:
+            before: The filter before the change.
+            why: What speaks for it.
+            sure: Nothing else explains the images.
+        """
+        known = self.weighed(before)
+        self._before = self._before or {name: self._camera(name, known) for name in _seen(known)}
+        self._named = sure
+        if self._named:
+            self.announce_change(why)
+
     def changed(self, why: Cause) -> None:
         """The rig has changed: the calibration is found again."""
+        self._named = True
         self._change(why, Status.INCONSISTENT)
 
     def held_back(self, ratio: float, f: CalibrationFilter, camera: str) -> None:
@@ -148,8 +177,8 @@ class StatusEvaluator(Evaluator):
                 reported = reported._replace(guidance=self._cover.advice())
         if f is None and stale is not None and self._ever_converged:
             self._before = self._before or cameras
-        elif self._before and self.status == Status.CONVERGED:
-            self._report_change(cameras)
+        elif f is not None and self._before:
+            self._report_change(cameras, f.state.t_s)
         return self._put_together(
             reported,
             cameras,
@@ -161,12 +190,28 @@ class StatusEvaluator(Evaluator):
             refused=self._points[0] / max(self._points[1], 1),
         )
 
-    def _report_change(self, now: dict[str, CameraEstimate]) -> None:
-        """Report what differs from before the bump, or that nothing does."""
+    def _report_change(self, now: dict[str, CameraEstimate], t_s: float) -> None:
+        """Name what has changed as soon as that is known; once it is known well, report by how much."""
+        moved, lens = {}, {}
         for name, before in self._before.items():
-            found = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
-            unchanged = Event(EventKind.NOT_BUMPED, name, visible_move_m(before, now[name]))
-            self.announce_all(found or [unchanged])
+            moved[name] = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
+            lens[name] = lens_difference(name, before, now[name], self.elapsed_s)
+        if not self._named and any(moved.values()):
+            self._named = True
+            self.announce_change(Cause.IMAGES_DISAGREE)
+        since_s = t_s - max(self._started_s or 0.0, self._reopened_s)
+        visible_m = {name: visible_move_m(before, now[name]) for name, before in self._before.items()}
+        well = since_s >= _ENOUGH_S or max(visible_m.values()) <= IRRELEVANT_M
+        known = well and self.status == Status.CONVERGED
+        for event in (event for events in lens.values() for event in events):
+            if known or event.sigma is None or event.sigma < IRRELEVANT_PX:
+                self.announce(event, once=f"lens {event.camera} {self._reopened_s}")
+        if not known:
+            return
+        if not any(moved.values()) and not any(lens.values()):
+            self.announce_all(Event(EventKind.NOT_BUMPED, name, visible_m[name]) for name in moved)
+        for events in moved.values():
+            self.announce_all(events)
         self._before = {}
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:

@@ -2,87 +2,135 @@
 
 A filter from before the change follows the images once more. `JumpScores` say when each part may have jumped.
 Copies of the filter to which that part is unknown from there on follow them again. The part under which the
-images are most likely is the one that jumped, if they are more likely than without a jump.
+images are most likely is the one that jumped, if they are more likely than without a jump. Parts that explain
+them nearly as well may have jumped, too: the filter goes on with all of these unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.jump_scores import JumpScores
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import SKEW_SIGMA
+from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, VELOCITY, Layout, State
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 
 _SHIFT_S = 5e-3
 """One sigma of a step of the time shift, s; orientations of single images show those of 3 ms and more."""
-_TURN_RAD, _MOVE_M = np.radians(2.0), 0.02
-"""Of a jump of the mounting and of the lever arm."""
+_TURN_RAD, _MOVE_M = np.radians(5.0), 0.05
+"""Of a jump of a mounting, or of the target. Bumps of four times as much are followed."""
 _ZOOM, _SHIFTED = 0.02, 0.01
 """Of a jump of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused from far
 to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
 
-_RARER = 20.0
-"""So much more likely, in logarithms, must the lens be than a bump. In the first second after a bump of 5 to
-10 mm it explains images as well, with fewer unknowns: it was up to 11 more likely (ten bumps)."""
+_ODDS = 20.0
+"""A part may have jumped unless another is so much more likely, in logarithms. In the first second after a
+bump of 5 to 10 mm another lens explains images as well, with fewer unknowns: it was up to 11 more likely (ten
+bumps)."""
 
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
 class Part(Enum):
-    """Of the calibration, one that may jump."""
+    """What may jump: mountings, of each camera apart or as one, the target, or another part of a camera."""
 
     NONE = auto()
     SHIFT = auto()
     DRIFT = auto()
     MOUNTING = auto()
+    IMU = auto()
     LENS = auto()
+    TARGET = auto()
 
 
-class _Jump(NamedTuple):
-    """Errors that may jump together.
-
-    Attributes:
-        errors: Their indices, length q.
-        sigma: By how much, one sigma, shape (q,).
-    """
-
-    errors: list[int]
-    sigma: FloatArray
+MOVED = frozenset({Part.MOUNTING, Part.IMU})
+"""What is announced as a bump."""
 
 
-def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, _Jump]:
-    """Parts of the calibration of a camera that may jump."""
+def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
+    """Parts that may jump: directions of the errors, each as long as one sigma of the jump, shape (n, q)."""
     layout, out = f.layout, {}
-    where = layout.cameras[camera]
+    where, every = layout.cameras[camera], range(layout.size)
     if where.timeshift is not None:
-        out[Part.SHIFT] = _Jump([where.timeshift], np.array([_SHIFT_S]))
+        out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [_SHIFT_S])
     if where.skew is not None:
-        out[Part.DRIFT] = _Jump([where.skew], np.array([SKEW_SIGMA]))
-    if where.rotation is not None and where.position is not None:
-        errors = [*range(layout.size)[where.rotation], *range(layout.size)[where.position]]
-        out[Part.MOUNTING] = _Jump(errors, np.repeat([_TURN_RAD, _MOVE_M], 3))
+        out[Part.DRIFT] = _columns(layout.size, [where.skew], [SKEW_SIGMA])
+    turns = [k for c in layout.cameras.values() if c.rotation is not None for k in every[c.rotation]]
+    moves = [k for c in layout.cameras.values() if c.position is not None for k in every[c.position]]
+    if turns or moves:
+        sigmas = np.repeat([_TURN_RAD, _MOVE_M], [len(turns), len(moves)])
+        out[Part.MOUNTING] = _columns(layout.size, turns + moves, sigmas)
     if where.intrinsics is not None and layout.lens_free(camera):
-        errors = [*range(layout.size)[where.intrinsics]]
         focal = float(f.state.cameras[camera].intrinsics[0])
-        out[Part.LENS] = _Jump(errors, focal * np.repeat([_ZOOM, _SHIFTED], 2))
+        out[Part.LENS] = _columns(
+            layout.size, every[where.intrinsics], focal * np.repeat([_ZOOM, _SHIFTED], 2)
+        )
+    if len(layout.cameras) > 1 and turns and moves:
+        out[Part.IMU] = _imu_moves(f.state, layout)
+    out[Part.TARGET] = _target_moves(f.state, layout.size)
     return out
 
 
-def what_jumped(
-    before: CalibrationFilter, images: Frames, camera: str, step: Step
-) -> tuple[Part, CalibrationFilter]:
-    """Which part of a camera's calibration jumped, and the filter that knows of it, after the images.
+def _columns(size: int, errors: Sequence[int], sigmas: npt.ArrayLike) -> FloatArray:
+    """Errors that jump independently, shape (size, q)."""
+    out = np.zeros((size, len(errors)))
+    out[errors, range(len(errors))] = sigmas
+    return out
 
-    None where the images are likeliest without a jump.
+
+def _imu_moves(state: State, layout: Layout) -> FloatArray:
+    """How mountings and lever arms jump with the imu under all cameras: turns, then moves, (size, 6)."""
+    out = np.zeros((layout.size, 6))
+    for name, where in layout.cameras.items():
+        camera = state.cameras[name]
+        if where.rotation is not None:
+            out[where.rotation, :3] = _TURN_RAD * camera.R_imu_cam.T
+        if where.position is not None:
+            out[where.position, :3] = -_TURN_RAD * so3.hat(camera.p_imu_cam)
+            out[where.position, 3:] = _MOVE_M * np.eye(3)
+    return out
+
+
+def _target_moves(state: State, size: int) -> FloatArray:
+    """How motion and gravity, in the target's frame, jump with the target: turns, then moves, (size, 6)."""
+    out = np.zeros((size, 6))
+    out[ATTITUDE, :3] = _TURN_RAD * state.R_world_imu.T
+    out[POSITION, :3] = -_TURN_RAD * so3.hat(state.p_world_imu)
+    out[VELOCITY, :3] = -_TURN_RAD * so3.hat(state.v_world_imu)
+    out[GRAVITY, :3] = _TURN_RAD * state.tilt.T
+    out[POSITION, 3:] = _MOVE_M * np.eye(3)
+    return out
+
+
+class Found(NamedTuple):
+    """What has changed.
+
+    Attributes:
+        part: That explains the images best.
+        possible: Parts that may have jumped, that one and those that explain them nearly as well; empty:
+            no jump explains the images.
+        filter: After the images; these parts are unknown to it from the jump on. If the target was moved and
+            nothing else, just before the jump: the motion is found again as after any lost pose.
+    """
+
+    part: Part
+    possible: frozenset[Part]
+    filter: CalibrationFilter
+
+
+def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found:
+    """Which part of a camera's calibration jumped, or the target.
 
     Args:
         before: From before the change; is left as it is.
@@ -90,24 +138,56 @@ def what_jumped(
         camera: Of which images do not fit.
         step: Propagates a filter to an image and corrects it.
     """
-    jumps = _jumps(before, camera)
-    best, found = _likelihood(before, images, jumps, step)
-    part_found, found_filter = Part.NONE, before
+    odds = _ODDS * before.consistency[camera].strictness
+    none, instants, sizes = _suspects(before, images, camera, step, odds)
+    found: dict[Part, tuple[float, int]] = {}
+    filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
     for k, image in enumerate(images):
-        for part in (part for part, instants in found.items() if k in instants):
-            jumped = deepcopy(f)
-            columns = np.zeros((len(f.S), len(jumps[part].errors)))
-            columns[jumps[part].errors, range(columns.shape[1])] = jumps[part].sigma
-            jumped.inflate_covariance(columns)
-            if part is Part.LENS:  # what stretches of the data said about it no longer holds
-                jumped.agreement[camera] = LensAgreement(jumped.agreement[camera].model)
-            total = likelihood + sum(_follow(jumped, x, step) for x in images[k:])
-            total -= _RARER if part is Part.LENS else 0.0
-            if total > best:
-                best, part_found, found_filter = total, part, jumped
-        likelihood += _follow(f, image, step)
-    return part_found, found_filter
+        for part in (part for part, at in instants.items() if k in at):
+            filters.setdefault(k, deepcopy(f))
+            after = _follow_after(filters[k], {part: 1.0}, images[k:], camera, step)
+            found[part] = max(found.get(part, (none, -1)), (likelihood + after.likelihood, k))
+        likelihood += _follow(f, image, step)[0]
+    if not found:
+        return Found(Part.NONE, frozenset(), before)
+    best = max(found, key=lambda part: found[part][0])
+    total, k = found[best]
+    possible = {part for part, (other, at) in found.items() if at >= 0 and other > total - odds}
+    if total > none + odds and possible == {Part.TARGET}:
+        return Found(best, frozenset(possible), filters[k])
+    if total > none + odds:
+        unknown = {part: sizes(part, k) for part in possible}
+        after = _follow_after(filters[k], unknown, images[k:], camera, step)
+        for consistency in after.filter.consistency.values():
+            consistency.settle()
+        if 2 * after.used > len(images) - k:
+            return Found(best, frozenset(possible), after.filter)
+    return Found(Part.NONE, frozenset(), before)
+
+
+class _After(NamedTuple):
+    """A filter after images, their log-likelihood, and how many of them it used."""
+
+    filter: CalibrationFilter
+    likelihood: float
+    used: int
+
+
+def _follow_after(
+    before: CalibrationFilter,
+    parts: Mapping[Part, npt.ArrayLike],
+    images: Frames,
+    camera: str,
+    step: Step,
+) -> _After:
+    """Take images with a copy of a filter to which parts are unknown, by so many times their sigmas."""
+    f, jumps = deepcopy(before), _jumps(before, camera)
+    f.inflate_covariance(np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1))
+    if Part.LENS in parts:  # what stretches of the data said about it no longer holds
+        f.agreement[camera] = LensAgreement(f.agreement[camera].model)
+    likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
+    return _After(f, sum(likelihoods), sum(used))
 
 
 def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
@@ -116,29 +196,44 @@ def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: st
     return Event(EventKind.LENS_STEPPED, camera, float(np.subtract(*focal)))
 
 
-def _likelihood(
-    before: CalibrationFilter, images: Frames, jumps: Mapping[Part, _Jump], step: Step
-) -> tuple[float, dict[Part, set[int]]]:
-    """Log-likelihood of images without a jump, and the images just before which each part may have jumped."""
+def _suspects(
+    before: CalibrationFilter, images: Frames, camera: str, step: Step, odds: float
+) -> tuple[float, dict[Part, set[int]], Callable[[Part, int], FloatArray]]:
+    """What may have jumped, and when.
+
+    Args:
+        before: As for `what_jumped`, and likewise the rest.
+        images: Since then.
+        camera: Of which images do not fit.
+        step: Propagates and corrects a filter.
+        odds: By how much a jump must be more likely than none, in logarithms.
+
+    Returns:
+        Log-likelihood of the images without a jump; by part, the images just before which it may have jumped,
+        nothing where no jump is likely; how far a part jumped just before an image, over one sigma.
+    """
     f = deepcopy(before)
-    errors = np.concatenate([x.errors for x in jumps.values()]).astype(np.intp)
-    f.jumps = scores = JumpScores.of(errors, len(f.S))
-    likelihood, refused = 0.0, set[int]()
+    f.jumps = scores = JumpScores.of(len(f.S), sum(x.shape[1] for x in _jumps(f, camera).values()))
+    likelihood, refused, fits = 0.0, set[int](), True
     for k, (t_cam_s, frame) in enumerate(images):
-        scores.begin()
+        jumps = _jumps(f, camera)
+        scores.begin(np.concatenate(list(jumps.values()), axis=1))
         report = step(f, frame, t_cam_s)
         likelihood += 0.0 if report is None else report.log_likelihood
-        if report is not None and not report.used and not refused:
+        fits = report is None or report.used
+        if not fits and not refused:
             refused.add(k)  # it tells the scores nothing; a large jump may be just before the first of them
-    instants, end = {}, 0
-    for part, jump in jumps.items():
-        own = slice(end, end + len(jump.errors))
-        k, end = int(scores.log_ratios(own, jump.sigma).argmax()), own.stop
-        instants[part] = {k - 1, k, k + 1} | refused
-    return likelihood, instants
+    ends = np.cumsum([x.shape[1] for x in jumps.values()])
+    own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps.items(), ends, strict=True)}
+    ratios = {part: scores.log_ratios(of) for part, of in own.items()}
+    if fits and max(x.max() for x in ratios.values()) < odds:
+        return likelihood, {}, lambda part, k: scores.sizes(own[part], k)
+    best = {part: int(x.argmax()) for part, x in ratios.items()}
+    instants = {part: {k - 1, k, k + 1} | refused for part, k in best.items()}
+    return likelihood, instants, lambda part, k: scores.sizes(own[part], k)
 
 
-def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> float:
-    """Take an image; its log-likelihood."""
+def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:
+    """Take an image; its log-likelihood, and whether it was used."""
     report = step(f, image[1], image[0])
-    return 0.0 if report is None else report.log_likelihood
+    return (0.0, False) if report is None else (report.log_likelihood, report.used)
