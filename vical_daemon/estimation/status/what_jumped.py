@@ -176,7 +176,7 @@ class _After(NamedTuple):
 
 def _follow_after(
     before: CalibrationFilter,
-    parts: Mapping[Part, npt.ArrayLike],
+    parts: Mapping[Part, FloatArray | float],
     images: Frames,
     camera: str,
     step: Step,
