@@ -13,6 +13,7 @@ import numpy as np
 from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
+from vical_daemon.estimation.filter.image_pace import ImagePace
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
@@ -67,7 +68,7 @@ class Calibrator:
         self.rig = RigModel(options, cameras, np.asarray(target_points_m, dtype=np.float64))
         self.evaluator = StatusEvaluator(options)
         self.filter: CalibrationFilter | None = None
-        self._intake = SensorIntake()
+        self._intake, self._pace = SensorIntake(), ImagePace(options.imu_noise)
         self._pending = FrameQueue(list(cameras))
         self._initializer = self._new_initializer()
         self._late = LateCameras(options, self.rig, self._step)
@@ -122,7 +123,8 @@ class Calibrator:
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
-        self._pending.push(t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer))
+        if self._pace.takes(frame.camera, t_cam_s, self.evaluator.motion.rate_change_rps2, self._buffer):
+            self._pending.push(t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer))
 
     def _clock_was_set(self, camera: str) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""

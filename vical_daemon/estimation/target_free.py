@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.events import Cause
+from vical_daemon.estimation.filter.image_pace import Thinning
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
@@ -39,7 +40,6 @@ from vical_daemon.estimation.smoother.waiting_tracks import (
     STEP_S,
     Ready,
     Stamped,
-    Thinning,
     cleaned,
     ready,
 )
@@ -101,7 +101,7 @@ class TargetFreeCalibrator:
         self._confirmed = False  # a second window contradicts what was known
         self._seek_shift = False  # the time shift is to be found again, and its step has been reported
         self._newest_s = -np.inf  # stamp of the last image, used or not
-        self._thinning = Thinning(MAX_RATE_HZ)
+        self._thinning = Thinning()
         self._reports: list[FrameReport] = []
         self._stepped_s = 0.0  # by how much the imu's stamps were moved in the recording before
         self._anew = False  # another recording begins: its biases are not known
@@ -143,7 +143,7 @@ class TargetFreeCalibrator:
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set()
         self._newest_s = t_cam_s
-        if not self._thinning.takes(t_cam_s):
+        if not self._thinning.takes(t_cam_s, 1.0 / MAX_RATE_HZ):
             return
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= LEAST_POINTS:

@@ -327,7 +327,10 @@ class CalibrationFilter:
             information -= known.T @ known
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
-        return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
+        score = self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
+        if fit.again:  # its derivatives do not have the error of the prediction
+            score[-1] = 0.0
+        return score
 
     def allowing_for_arm_bias(self) -> CalibrationFilter:
         """The filter with sigmas that allow for what is not known of the bias that was subtracted.

@@ -50,6 +50,7 @@ class ImageFit:
         rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
         log_det: Logarithm of the determinant of the covariance of what the state can explain, whitened.
         noise: Of the kept corners over `Image.sigma_px`; by both all but `rest` and `left` is whitened.
+        again: The image was linearised again about the result.
     """
 
     S: FloatArray
@@ -65,6 +66,7 @@ class ImageFit:
     rows: tuple[FloatArray, FloatArray]
     log_det: float
     noise: float
+    again: bool = False
 
 
 def log_likelihood(fit: ImageFit | None, image: Image) -> float:
@@ -155,6 +157,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
             # the innovation refers to the prior mean
             spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
         fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
+        fit.again = step > 0
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)

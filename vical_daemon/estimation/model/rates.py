@@ -11,6 +11,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import State
 
 SLOPE_S = 0.02
+RATE_BLOCK_S = 0.1  # over which rates are averaged before their changes are looked at
 
 
 class Rates(NamedTuple):

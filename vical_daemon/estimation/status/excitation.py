@@ -16,6 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.measurements import ConvergenceTargets, FloatArray
+from vical_daemon.estimation.model.rates import RATE_BLOCK_S
 from vical_daemon.estimation.temporal.rotation_turns import MIN_RATE_RPS
 from vical_daemon.estimation.wording import ALONG
 
@@ -26,7 +27,6 @@ _SLOW_RPS = math.radians(12.0)
 _ONE_AXIS = (
     0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis
 )
-_BLOCK_S = 0.1
 _STEADY = 0.3  # change of the rate in a second over the rate, below which it turns steadily
 _NEAR = 0.5  # cosine above which turning about an axis is much the same as about a direction
 _GOOD_AXES: tuple[Axis, ...] = ("x", "y")  # any two will do; with these the target stays in view
@@ -43,7 +43,7 @@ class RunningMotion:
     """
 
     def __init__(self, memory_s: float = 20.0) -> None:
-        self._keep = float(np.exp(-_BLOCK_S / memory_s))
+        self._keep = float(np.exp(-RATE_BLOCK_S / memory_s))
         self._begin_s = float("nan")
         self._sum, self._count = [0.0, 0.0, 0.0], 0
         self._last: FloatArray | None = None
@@ -57,7 +57,7 @@ class RunningMotion:
         total[1] += gyro_rps[1]
         total[2] += gyro_rps[2]
         self._count += 1
-        if not t_s - self._begin_s < _BLOCK_S:  # also at the first reading
+        if not t_s - self._begin_s < RATE_BLOCK_S:  # also at the first reading
             self._finish_block(t_s)
 
     def _finish_block(self, t_s: float) -> None:
@@ -67,7 +67,7 @@ class RunningMotion:
         self._weight = self._keep * self._weight + 1.0
         self._mean += (rate - self._mean) / self._weight
         self._scatter += (rate[:, None] * rate - self._scatter) / self._weight
-        if self._last is not None and dt < 3.0 * _BLOCK_S:
+        if self._last is not None and dt < 3.0 * RATE_BLOCK_S:
             self._changes = self._keep * self._changes + 1.0
             change = (rate - self._last) / dt
             self._change += (float(change @ change) - self._change) / self._changes

@@ -55,3 +55,8 @@ def test_a_larger_picture_of_the_same_lens_has_a_smaller_limit_by_angle():
     large = limit(camera("radtan", 1040.0, LENSES["radtan"][1], (1280, 960)))
     assert large[0] / 1040.0 == pytest.approx(0.5 * small[0] / 520.0, rel=0.05)
     assert large[4] == pytest.approx(0.5 * small[4], rel=0.05)
+
+
+def test_a_lens_without_rays_has_no_limit():
+    """Of a filter that has lost its way: nothing is raised."""
+    assert np.isfinite(limit(camera("equidistant", 1.0, [0.5, -3.0, 5.0, -2.0]))).all()
