@@ -31,6 +31,8 @@ _FLOOR, _NO_FLOOR = 0.16, 0.53
 """Scatter of the earliest arrivals of blocks over that of all, by 20 in a block: of delays 0.05 (exponential)
 to 0.16 (even); of normal errors 0.53, and with 200 in a block 0.43."""
 _TINY_S = 1e-9
+_DECIMAL_NS = (10**4, 10**5, 10**6, 10**7)
+"""Steps in which programs write stamps, ns: 10 us to 10 ms. Finer ones do not matter."""
 CERTAIN = 3.0
 """Standard errors by which the motion must be smoother over the even stamps: one chance in 740."""
 
@@ -77,8 +79,8 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
         gyro_rps: Rates, rad/s, shape (n, 3): they tell on which time axis the motion is smoother.
 
     Returns:
-        None where the stamps are fine as they are: even already, rounded to a decimal unit, or of readings
-        that were really taken unevenly.
+        None where the stamps are fine as they are: even already, rounded to a small decimal unit, or of
+        readings that were really taken unevenly.
     """
     if len(t_ns) < 3:
         return None
@@ -94,11 +96,16 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
     bounds = [*starts, len(t_s)]
     grid_s = np.concatenate([period_s * np.arange(end - begin) for begin, end in pairwise(bounds)])
     late = lateness(grid_s, t_s - grid_s, bounds, block)
+    written_s = 1e-9 * _written_in_ns(t_ns)
+    if written_s and np.ptp(t_s - grid_s - late.late_s) < 1.05 * written_s:  # rounded up or down, not late
+        late = lateness(grid_s, t_s - grid_s, bounds, block, log_odds=-math.inf)
+        late = late._replace(sigma_s=math.hypot(late.sigma_s, written_s / math.sqrt(12.0)))
     even_s = grid_s + late.late_s
     taken_s = t_s - even_s
     jitter_s = float(taken_s.std())
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
-    if jitter_s < _EVEN_S or rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
+    known = not written_s and rounded(t_ns, taken_s, period_s)
+    if jitter_s < _EVEN_S or known or (np.diff(new_ns) <= 0).any():
         return None
     gain = _surprise(gyro_rps[sort], t_s[sort]) - _surprise(gyro_rps, even_s)
     if not gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
@@ -257,8 +264,19 @@ def rounded(t_ns: IntArray, taken_s: FloatArray, period_s: float) -> bool:
     spread_ns = float(np.ptp(taken_s)) * 1e9
     return any(
         spread_ns < 1.05 * unit <= 1.05e9 * period_s and not ((t_ns - t_ns[0]) % unit).any()
-        for unit in (10**4, 10**5, 10**6, 10**7)
+        for unit in _DECIMAL_NS
     )
+
+
+def _written_in_ns(t_ns: IntArray) -> int:
+    """The shortest interval, ns, if it is a power of ten and intervals are 0, once and several times that.
+
+    Else 0. Stamps of a device are so if they were rounded to about its interval, or if it loses readings.
+    """
+    intervals_ns = np.diff(np.sort(t_ns))
+    shortest_ns = int(intervals_ns[intervals_ns > 0].min(initial=np.iinfo(np.int64).max))
+    alike = (intervals_ns == shortest_ns).all() or (intervals_ns % shortest_ns).any()
+    return shortest_ns if not alike and shortest_ns in _DECIMAL_NS else 0
 
 
 def _surprise(values: FloatArray, t_s: FloatArray) -> FloatArray:

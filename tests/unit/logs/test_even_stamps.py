@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,22 @@ def test_even_stamps_stay_as_they_are(rates) -> None:
 @pytest.mark.parametrize("unit_ns", [10_000, 100_000, 1_000_000])
 def test_rounded_stamps_stay_as_they_are(rates, unit_ns) -> None:
     assert even_stamps(truth_ns() // unit_ns * unit_ns, rates) is None
+
+
+@pytest.mark.parametrize("rate_hz", [80.0, 130.0, 250.0])
+@pytest.mark.parametrize("up_ns", [0, 5_000_000], ids=["down", "to the nearest"])
+def test_stamps_rounded_to_about_the_interval_are_not_late(rate_hz, up_ns) -> None:
+    """As delays they had put the time shift 4.6 ms off at a sigma of 0.03 ms."""
+    t_s = np.arange(8000) / rate_hz
+    gyro = np.stack([np.sin(1.9 * t_s), np.sin(2.3 * t_s + 1.0), np.sin(3.1 * t_s + 2.0)], axis=1)
+    true_ns = np.round(1e9 * t_s).astype(np.int64)
+    unit_ns = 10_000_000
+    even = even_stamps((true_ns + up_ns) // unit_ns * unit_ns, gyro)
+    assert even is not None and not even.delays
+    off_s = 1e-9 * (even.t_ns - true_ns)
+    assert off_s.std() < 1e-4
+    assert abs(off_s.mean()) < 2.0 * even.sigma_s
+    assert even.sigma_s == pytest.approx(1e-2 / math.sqrt(12.0), rel=0.05)
 
 
 def test_readings_that_were_taken_unevenly_stay_where_they_are(rates) -> None:
