@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help="result (.json), log (.mcap), Kalibr's camchain (.yaml), or `store` (the latest)",
+        help="result (.json), log (.mcap), Kalibr's camchain (.yaml), a store's folder, `store` (the latest)",
     )
     parser.add_argument("--format", required=True, choices=FORMATS, metavar="F", help=", ".join(FORMATS))
     parser.add_argument(

@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against",
         metavar="SOURCE",
         required=True,
-        help="result, log, file of the store, `store` (the latest), Kalibr's or OpenVINS's files, or of ROS "
-        "CameraInfo and static transforms in a YAML file or bag",
+        help="result, log, `store` (the latest), a store's folder or file, Kalibr's or OpenVINS's files, or of "
+        "ROS CameraInfo and static transforms in a YAML file or bag",
     )
     add_sensors(parser)
     parser.add_argument(

@@ -62,13 +62,16 @@ def read_source(source: str) -> Rig:
         InputError: Nothing there that holds a calibration.
         ExportError: A file that is not of the expected form.
     """
+    from vical_daemon.config.paths import state_directory
     from vical_daemon.results.files import read_rig
 
     path = Path(source)
     if source == "store" and not path.exists():
-        return _from_store()
+        return _from_store(state_directory() / "calibration")
     if not path.exists():
         raise InputError(f"{source}: no such file")
+    if path.is_dir() and any(path.glob("*.json")) and not any(path.glob("*.mcap")):
+        return _from_store(path)
     if path.is_dir() or path.suffix in (".mcap", ".bag") or path.name.endswith(".mcap.part"):
         return _from_log(path)
     return read_rig(path)
@@ -162,16 +165,18 @@ def _camera_name(topic: str) -> str:
     return name_of_topic(topic, "cam") if parsed is None else parsed.name
 
 
-def _from_store() -> Rig:
-    """Read the newest stored calibration of every camera."""
-    from vical_daemon.config.paths import state_directory
+def _from_store(folder: Path) -> Rig:
+    """Read the newest stored calibration of every camera.
+
+    Raises:
+        InputError: There is none.
+    """
     from vical_daemon.results.export import rig_from_estimate
     from vical_daemon.results.store import CalibrationStore
 
-    folder = state_directory() / "calibration"
     stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
     if not stored:
-        raise InputError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
+        raise InputError(f"no calibration is stored in {folder}: nothing has converged yet")
     cameras = {entry.camera: entry.known for entry in stored}
     estimate = replace(stored[-1].estimate, cameras=cameras)
     devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}

@@ -143,6 +143,8 @@ def test_store_gives_the_newest_calibration(tmp_path, capsys, monkeypatch):
     assert exported["cameras"]["cam0"]["timeshift_cam_imu_s"] == pytest.approx(0.003)
     assert main(["export", "store", "--format", "kalibr"]) == 0  # the README's line: nothing else is needed
     assert yaml.safe_load(capsys.readouterr().out)["cam0"]["resolution"] == [640, 480]
+    assert main(["export", str(tmp_path / "calibration"), "--format", "json"]) == 0  # its folder, by name
+    assert json.loads(capsys.readouterr().out)["cameras"] == exported["cameras"]
 
 
 @pytest.mark.parametrize(
