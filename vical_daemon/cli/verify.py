@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against",
         metavar="SOURCE",
         required=True,
-        help="result, log, `store` (the latest), a store's folder or file, Kalibr's or OpenVINS's files, or of "
+        help="result, log, `store` (the latest), a store's folder or file, Kalibr's or OpenVINS's files, or "
         "ROS CameraInfo and static transforms in a YAML file or bag",
     )
     add_sensors(parser)
