@@ -34,13 +34,13 @@ class Found(Protocol):
         ...
 
 
-def make_detector(config: Config, predictor: FlowPredictor | None, tell: Callable[[str], None]) -> Detect:
+def make_detector(config: Config, predictor: FlowPredictor | None, report: Callable[[str], None]) -> Detect:
     """Make the detector of one camera; it may keep the last image.
 
     Args:
         config: The rig.
         predictor: Predicts the flow of natural features; not used with a board.
-        tell: Called with what images contradict in the target file, one line.
+        report: Called with what images contradict in the target file, one line.
 
     Raises:
         ConfigError: The target file is missing or wrong.
@@ -55,4 +55,4 @@ def make_detector(config: Config, predictor: FlowPredictor | None, tell: Callabl
 
     assert config.target_path is not None  # checked by `config.load`
     target = load_target(config.target_path)
-    return BoardDetector(target, check=TargetCheck(target, tell)).detect
+    return BoardDetector(target, check=TargetCheck(target, report)).detect

@@ -190,7 +190,7 @@ REFERENCE: dict[EventKind, About] = {
         "images were wrong. Value: the least move of the camera that would show.",
         "m",
         "With a target: at the latest 10 s after `bumped`, or after images that a moved camera and a moved "
-        "target explain equally well, once converged, if nothing differs as for `camera_moved`.",
+        "target explain about equally well, once converged, if nothing differs as for `camera_moved`.",
     ),
     EventKind.WENT_ON: About(
         "Target-free: images are used again; the calibration was kept.", "", "When a pause ends."

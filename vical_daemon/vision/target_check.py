@@ -1,7 +1,7 @@
-"""Says how pictures contradict the target file: other tags, another layout, other counts of corners.
+"""Finds how images contradict the target file: other tags, another layout, other counts of corners.
 
-A board that is not the stated one is not found, or worse, found in part. A person then reads that the target
-is not in view. So some pictures are compared with boards near the stated one.
+A board that differs from its target file is not found, or worse, found in part. The user then reads that the
+target is not in view. So some images are compared with boards that differ from the file by a usual mistake.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from vical_daemon.vision.target import TAG_FAMILY_SIZE, AprilGrid, Checkerboard,
 
 _ANY_TAG = AprilGrid(TAG_FAMILY_SIZE, 1, 1.0, 0.3)
 MIN_TAGS = 6
-"""Tags that a layout is judged by: twelve numbers for eight of a homography, one of a lens and the layout."""
+"""Least number of tags that show a layout: twelve coordinates, for eight numbers of a homography, one of a
+lens, and the layout."""
 MAX_MISFIT = 0.03
-"""RMS distance of tags from their places in the right layout, over the edge of a tag. In rendered pictures it
-is at most 0.02, also with a fisheye lens; with a wrong number of columns it is 1 to 3."""
+"""Largest RMS distance of tags from their places in the right layout, over the edge of a tag. In rendered
+images it is at most 0.02, also with a fisheye lens; with a wrong number of columns it is 1 to 3."""
 SPACING_ERROR = 0.01
-"""Difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
+"""Least difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
 _FIRST, _EVERY, _RARER = 10, 20, 0.25
-"""The first picture that is looked at, and then each after so many more, or after this share of all so far: a
-camera that waits all day for its board takes no time for it."""
-_TAGS_A_TURN = 4  # kinds of tags that one picture is searched for
-_MAX_COLS = 30
-_SPACINGS = np.geomspace(0.02, 2.0, 24)
-_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+"""The first image that is checked; images from one check to the next; the same as a share of all images so
+far. So a camera that waits all day for its board spends no time on checks."""
+_TAGS_A_TURN = 4  # kinds of tags that one image is searched for
+_MAX_COLS = 30  # of boards that are tried
+_SPACINGS = np.geomspace(0.02, 2.0, 24)  # gaps over tags that are tried first
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # of a tag, in edges
+# Added to the stated columns and rows: squares were counted, or one less than corners, or one is miscounted.
 _OTHER_COUNTS = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2))
 _FAMILIES = {
     "AprilTag 36h11": cv2.aruco.DICT_APRILTAG_36h11,
@@ -49,30 +51,29 @@ _OTHER_TAGS = [
 
 
 class TargetCheck:
-    """Compares pictures of one camera with the target file, until one fits or two say the same.
+    """Compares images of one camera with the target file, until one fits or two agree on a mistake.
 
     Args:
         target: As the file states it.
-        tell: Called once, with what two pictures contradict, one line.
+        report: Called once, with what the images contradict, one line.
     """
 
-    def __init__(self, target: Target, tell: Callable[[str], None]) -> None:
-        self._target, self._tell = target, tell
+    def __init__(self, target: Target, report: Callable[[str], None]) -> None:
+        self._target, self._report = target, report
         self._settled = False
         self._turn = self._taken = 0
         self._next = _FIRST
         self._last = ""
 
     def take(self, gray: Gray, *, found: bool) -> None:
-        """Look at a picture.
+        """Check an image, if it is one's turn.
 
         Args:
-            gray: The picture.
+            gray: The image, uint8.
             found: The board was found in it, or what looks like a part of it.
         """
-        self._settled = self._settled or (
-            found and isinstance(self._target, Checkerboard)
-        )  # found as a whole
+        if found and isinstance(self._target, Checkerboard):  # found as a whole
+            self._settled = True
         self._taken += 1
         if self._settled or self._taken < self._next:
             return
@@ -83,17 +84,17 @@ class TargetCheck:
             return
         self._settled = text in ("", self._last)
         if self._settled and text:
-            self._tell(text)
+            self._report(text)
         self._last = text
 
 
 def contradiction(gray: Gray, target: Target, turn: int = 0) -> str | None:
-    """Return what in the target file a picture contradicts, "" if it fits, None if it does not tell.
+    """Return what in the target file an image contradicts, "" if it fits, None if the image does not show it.
 
     Args:
-        gray: The picture, uint8.
+        gray: The image, uint8.
         target: As the file states it.
-        turn: Of several other boards that take long to search for, one is tried in its turn.
+        turn: Number of the check: other boards that take long to search for are tried in turn.
     """
     ids, quads = search_tags(SaddleImage(gray), gray, _ANY_TAG)
     if isinstance(target, Checkerboard):
@@ -130,7 +131,7 @@ def _other_layout(
 
 
 def _misfit_of_rows(index: IntArray, quads: FloatArray, cols: int, shape: tuple[int, int]) -> float:
-    """RMS distance of the middles of tags from a grid with rows of `cols`, over the edge of a tag."""
+    """RMS distance of the centres of tags from a grid with `cols` columns, over the edge of a tag."""
     at = np.stack([index % cols, index // cols], axis=1).astype(np.float64)
     if cols > 1 and np.ptp(at[:, 0]) == 0.0:
         return float("inf")
@@ -139,7 +140,7 @@ def _misfit_of_rows(index: IntArray, quads: FloatArray, cols: int, shape: tuple[
 
 
 def _spacing(index: IntArray, quads: FloatArray, cols: int, shape: tuple[int, int]) -> float:
-    """Gap between tags over their size, by the best fit of all corners."""
+    """Gap between tags over their size, by the best fit of all corners: on a grid that is refined twice."""
     at = np.stack([index % cols, index // cols], axis=1)[:, None]
     spacings = _SPACINGS
     for _ in range(3):

@@ -66,16 +66,16 @@ class TestDetect:
     ) -> None:
         events: list[tuple[str, str]] = []
         monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append((name, text)))
-        tells: list[Any] = []
+        reports: list[Any] = []
 
-        def make(_config: Config, _predictor: Any, tell: Any) -> Any:
-            tells.append(tell)
+        def make(_config: Config, _predictor: Any, report: Any) -> Any:
+            reports.append(report)
             return lambda picture, t_ns: None
 
         monkeypatch.setattr(detect, "make_detector", make)
         role = DetectRole(config, "cam0")
         role.points(image(NOW))
-        tells[0]("the tags stand in rows of 6, the target file states tagCols: 5")
+        reports[0]("the tags stand in rows of 6, the target file states tagCols: 5")
         status = role.status()
         assert status.level is Level.ERROR and status.message.startswith("the tags stand in rows of 6")
         assert events == [("wrong_target", f"cam0: {status.message}")]

@@ -1,8 +1,8 @@
 """When a part of the calibration jumped: likelihood ratios of all instants from one run of a filter.
 
 A filter that does not know that some errors jumped by nu just before image k sees innovations of the mean
-H_t D_t nu. D begins as the unit columns of these errors, moves with the state from image to image, and loses
-what each correction takes off. So one run gives, for each k, what the innovations say of nu.
+H_t D_t nu. D begins with one column for each direction of the jump, is propagated from image to image, and is
+reduced by each correction. So one run gives, for each k, the information about nu in the innovations.
 [Willsky and Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in
 linear systems", 1976]
 """
@@ -21,10 +21,12 @@ from vical_daemon.estimation.model.unscented import solve_lower, unit
 class JumpScores:
     """What the images of a run say about jumps just before each of them.
 
+    Jumps are over one sigma of theirs, so that the prior of each is a unit normal distribution.
+
     Attributes:
-        D: Jumps of one sigma as they are now, by each instant and direction, shape (n, k p).
-        information: Of each instant, shape (k, p, p).
-        weighted: That times the jump, shape (k, p).
+        D: Errors now, after a jump of one sigma, by its instant and direction, shape (n, k p).
+        information: A of the jump before each of k images, shape (k, p, p).
+        weighted: Information vector b, whose mean is A times the jump, shape (k, p).
     """
 
     D: FloatArray
@@ -33,7 +35,7 @@ class JumpScores:
 
     @classmethod
     def of(cls, size: int, p: int) -> JumpScores:
-        """Of a filter with `size` errors, and jumps in `p` directions."""
+        """Return empty scores for a filter with `size` errors, and jumps in `p` directions."""
         return cls(np.zeros((size, 0)), np.zeros((0, p, p)), np.zeros((0, p)))
 
     def begin(self, columns: FloatArray) -> None:

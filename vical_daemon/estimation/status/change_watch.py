@@ -1,9 +1,10 @@
 """Decides when the rig has changed, and what to do about it.
 
-A strong jump makes images unusable (they are refused); a weaker one raises the innovations (CUSUM in
-`Consistency`); a time shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). At
-the first signs it is asked what has jumped (`what_jumped`). If nothing explains the images, the pose is found
-again; only if they still do not fit, calibration starts over.
+After a large jump images are refused. A smaller one raises the innovations (CUSUM in `Consistency`). A time
+shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). At the first signs the
+calibrator looks for what has jumped (`what_jumped`). If nothing explains refused images, the pose is found
+again. Calibration starts over only if images are refused even then, or if nothing explains why the CUSUM has
+fired.
 """
 
 from __future__ import annotations
@@ -72,14 +73,19 @@ class DriftWatch:
 
 
 _IMAGES = 10
-"""So many refused in a row: the pose is found again, and soon after that the calibration. So many images
-after an alarm show what has changed."""
-_SOON_S = 4.0
+"""Images refused in a row after which the pose is found again, and images after an alarm that show what has
+changed."""
+_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 
 class Action(Enum):
-    """What is to be done after an image."""
+    """What is to be done after an image.
+
+    ASK, POSE and RESTART look for what has jumped first. If nothing explains the images, ASK does nothing,
+    POSE finds the pose again, and RESTART starts over. SKEW: the clocks run apart. WANDER: their drift has
+    changed.
+    """
 
     NONE = auto()
     ASK = auto()
@@ -108,10 +114,8 @@ class ChangeWatch:
 
     def started(self) -> None:
         """A filter starts."""
-        self._refused.clear()
-        self._closer = self._suspected = 0
+        self.shift_reopened()
         self._pose_taken_s = float("-inf")
-        self._drift.clear()
 
     def motion_restarted(self, t_s: float) -> None:
         """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
@@ -167,7 +171,7 @@ class ChangeWatch:
         return self._look_for_drift(report.camera, f)
 
     def _asks(self, consistency: Consistency, t_s: float) -> bool:
-        """Whether to see now if something has changed: after 10 images since it may have, 20, 40 ..."""
+        """Whether to look now for what has jumped: 10 images after the first sign, 20, 40 ..., within 3 s."""
         if t_s > self._suspected_s + BEFORE_S:
             self._suspected = 0
         if not self._suspected and consistency.suspicious:

@@ -1,9 +1,10 @@
 """What has changed when images no longer fit: the part of the calibration that explains them if it jumped.
 
-A filter from before the change follows the images once more. `JumpScores` say when each part may have jumped.
-Copies of the filter to which that part is unknown from there on follow them again. The part under which the
-images are most likely is the one that jumped, if they are more likely than without a jump. Parts that explain
-them nearly as well may have jumped, too: the filter goes on with all of these unknown.
+A filter from before the change follows the images once more. `JumpScores` give the most likely instants of a
+jump of each part. Copies of the filter follow the images again, one for each part and instant, with that part
+unknown from there on. The part under which the images are most likely is the one that jumped, if they are
+more likely than without a jump. Parts that explain them nearly as well may have jumped, too: the filter goes
+on with all of these unknown. [docs/math/filter.md, "Detection of changes"]
 """
 
 from __future__ import annotations
@@ -29,21 +30,23 @@ from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 _SHIFT_S = 5e-3
 """One sigma of a step of the time shift, s; orientations of single images show those of 3 ms and more."""
 _TURN_RAD, _MOVE_M = np.radians(5.0), 0.05
-"""Of a jump of a mounting, or of the target. Bumps of four times as much are followed."""
+"""One sigma of a jump of a mounting, or of the target, rad and m. Turns four times as large and
+moves twice as large are followed, too."""
 _ZOOM, _SHIFTED = 0.02, 0.01
-"""Of a jump of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused from far
-to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
+"""One sigma of a jump of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused
+from far to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
 
 _ODDS = 20.0
-"""A part may have jumped unless another is so much more likely, in logarithms. In the first second after a
-bump of 5 to 10 mm another lens explains images as well, with fewer unknowns: it was up to 11 more likely (ten
-bumps)."""
+"""Logarithm of the odds from which on an explanation is ruled out: no jump at all, or the jump of a part. In
+the first second after a bump of 5 to 10 mm another lens explains the images as well, with fewer unknowns: it
+was more likely by up to 11 (ten bumps)."""
 
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
+"""Propagates a filter to an image, stamped in s, and corrects it; None where inertial data are missing."""
 
 
 class Part(Enum):
-    """What may jump: mountings, of each camera apart or as one, the target, or another part of a camera."""
+    """What may jump: mountings, each by itself (MOUNTING) or all alike (IMU), the target, or other parts."""
 
     NONE = auto()
     SHIFT = auto()
@@ -90,7 +93,7 @@ def _columns(size: int, errors: Sequence[int], sigmas: npt.ArrayLike) -> FloatAr
 
 
 def _imu_moves(state: State, layout: Layout) -> FloatArray:
-    """How mountings and lever arms jump with the imu under all cameras: turns, then moves, (size, 6)."""
+    """How mountings and lever arms jump with the imu below all cameras: turns, moves, shape (size, 6)."""
     out = np.zeros((layout.size, 6))
     for name, where in layout.cameras.items():
         camera = state.cameras[name]
@@ -103,7 +106,7 @@ def _imu_moves(state: State, layout: Layout) -> FloatArray:
 
 
 def _target_moves(state: State, size: int) -> FloatArray:
-    """How motion and gravity, in the target's frame, jump with the target: turns, then moves, (size, 6)."""
+    """How motion and gravity in the target's frame jump with it: turns, then moves, shape (size, 6)."""
     out = np.zeros((size, 6))
     out[ATTITUDE, :3] = _TURN_RAD * state.R_world_imu.T
     out[POSITION, :3] = -_TURN_RAD * so3.hat(state.p_world_imu)
@@ -117,11 +120,12 @@ class Found(NamedTuple):
     """What has changed.
 
     Attributes:
-        part: That explains the images best.
-        possible: Parts that may have jumped, that one and those that explain them nearly as well; empty:
-            no jump explains the images.
-        filter: After the images; these parts are unknown to it from the jump on. If the target was moved and
-            nothing else, just before the jump: the motion is found again as after any lost pose.
+        part: The one that explains the images best.
+        possible: Parts that may have jumped: that one, and those that explain the images nearly as well;
+            empty: no jump explains them.
+        filter: The filter after the images; these parts are unknown to it from the jump on. If only the
+            target may have moved: the filter just before the jump, as the motion is found again as after any lost
+            pose. If no jump explains the images, the filter given.
     """
 
     part: Part
@@ -130,13 +134,13 @@ class Found(NamedTuple):
 
 
 def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found:
-    """Which part of a camera's calibration jumped, or the target.
+    """Find which part of the calibration of a camera jumped, or whether the target did.
 
     Args:
-        before: From before the change; is left as it is.
-        images: Since then, in order.
-        camera: Of which images do not fit.
-        step: Propagates a filter to an image and corrects it.
+        before: The filter from before the change; it is not modified.
+        images: Since then, of all cameras, in order.
+        camera: The one whose images do not fit.
+        step: Takes an image with a filter.
     """
     odds = _ODDS * before.consistency[camera].strictness
     none, instants, sizes = _suspects(before, images, camera, step, odds)
@@ -144,8 +148,10 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
     filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
     for k, image in enumerate(images):
-        for part in (part for part, at in instants.items() if k in at):
-            filters.setdefault(k, deepcopy(f))
+        parts = [part for part, at in instants.items() if k in at]
+        if parts:
+            filters[k] = deepcopy(f)
+        for part in parts:
             after = _follow_after(filters[k], {part: 1.0}, images[k:], camera, step)
             found[part] = max(found.get(part, (none, -1)), (likelihood + after.likelihood, k))
         likelihood += _follow(f, image, step)[0]
@@ -181,7 +187,15 @@ def _follow_after(
     camera: str,
     step: Step,
 ) -> _After:
-    """Take images with a copy of a filter to which parts are unknown, by so many times their sigmas."""
+    """Take images with a copy of a filter to which some parts are unknown.
+
+    Args:
+        before: The filter just before the jump.
+        parts: What jumped, and how far, over one sigma of the jump.
+        images: From the jump on.
+        camera: The one whose images do not fit.
+        step: Takes an image with a filter.
+    """
     f, jumps = deepcopy(before), _jumps(before, camera)
     f.inflate_covariance(np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1))
     if Part.LENS in parts:  # what stretches of the data said about it no longer holds
@@ -191,7 +205,7 @@ def _follow_after(
 
 
 def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
-    """Return what is announced where the lens jumped."""
+    """Return the event of a lens that jumped, with the difference of fx."""
     focal = (f.state.cameras[camera].intrinsics[0] for f in (after, before))
     return Event(EventKind.LENS_STEPPED, camera, float(np.subtract(*focal)))
 
@@ -199,13 +213,13 @@ def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: st
 def _suspects(
     before: CalibrationFilter, images: Frames, camera: str, step: Step, odds: float
 ) -> tuple[float, dict[Part, set[int]], Callable[[Part, int], FloatArray]]:
-    """What may have jumped, and when.
+    """Find what may have jumped, and when.
 
     Args:
-        before: As for `what_jumped`, and likewise the rest.
+        before: See `what_jumped`, also for `images`, `camera` and `step`.
         images: Since then.
-        camera: Of which images do not fit.
-        step: Propagates and corrects a filter.
+        camera: The one whose images do not fit.
+        step: Takes an image with a filter.
         odds: By how much a jump must be more likely than none, in logarithms.
 
     Returns:
@@ -222,7 +236,7 @@ def _suspects(
         likelihood += 0.0 if report is None else report.log_likelihood
         fits = report is None or report.used
         if not fits and not refused:
-            refused.add(k)  # it tells the scores nothing; a large jump may be just before the first of them
+            refused.add(k)  # rejected images are not in the scores; a large jump may be just before the first
     ends = np.cumsum([x.shape[1] for x in jumps.values()])
     own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps.items(), ends, strict=True)}
     ratios = {part: scores.log_ratios(of) for part, of in own.items()}
@@ -234,6 +248,6 @@ def _suspects(
 
 
 def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:
-    """Take an image; its log-likelihood, and whether it was used."""
+    """Take an image; return its log-likelihood, and whether it was used."""
     report = step(f, image[1], image[0])
     return (0.0, False) if report is None else (report.log_likelihood, report.used)
