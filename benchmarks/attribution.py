@@ -158,6 +158,7 @@ CASES: dict[str, Case] = {
     "bump": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 2.0, 0.01), sudden=True),
     "camera moved by 5 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.005), sudden=True),
     "camera moved by 3 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.003), sudden=True),
+    "camera turned by 0.3 deg": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.3, 0.0), sudden=True),
     "lens zoomed by 1 %": _is(Kind.LENS_STEPPED, after=partial(_zoomed, 1.01), sudden=True, board_only=True),
     "board moved by 20 mm": _is(*_BOARD, knocked=(0.0, 0.02), board_only=True, sudden=True),
     "board moved by 200 mm and 20 deg": _is(*_BOARD, knocked=(20.0, 0.2), board_only=True, sudden=True),

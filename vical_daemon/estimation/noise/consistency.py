@@ -162,7 +162,7 @@ class Consistency:
 
     @property
     def suspicious(self) -> bool:
-        """The innovations may have jumped: half of that, images that were refused counted."""
+        """The innovations may have jumped: half the limit of `alarmed`, with refused images counted, too."""
         return self.suspicion > 0.5 * _CUSUM_LIMIT * self.strictness
 
     @property

@@ -123,9 +123,9 @@ class Found(NamedTuple):
         part: The one that explains the images best.
         possible: Parts that may have jumped: that one, and those that explain the images nearly as well;
             empty: no jump explains them.
-        filter: The filter after the images; these parts are unknown to it from the jump on. If only the
-            target may have moved: the filter just before the jump, as the motion is found again as after any lost
-            pose. If no jump explains the images, the filter given.
+        filter: After the images; the possible parts are unknown to it from the jump on. If only the target
+            may have moved: just before the jump, as the motion is found again as after any lost pose. If no
+            jump explains the images: the filter given.
     """
 
     part: Part
