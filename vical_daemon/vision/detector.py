@@ -66,7 +66,7 @@ class BoardDetector:
     Args:
         target: The board.
         guided: Use the last frames; False: full search on every picture.
-        check: Compares searched pictures with the target file; None: nobody wants to know.
+        check: Compares images with the target file; None: no check.
     """
 
     def __init__(self, target: Target, guided: bool = True, check: TargetCheck | None = None) -> None:

@@ -17,7 +17,7 @@ SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
 images and inertial readings arrive shows the greater part."""
 _FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
-_SINKS = 1e-3  # by which the largest lead follows each image that is later
+_SINKS = 1e-3  # share of the difference by which the largest lead sinks at each image with a smaller one
 _AGREE = 5  # images in a row that show the same step
 _SETTLED = 10  # images after which the usual lead is known; a role may hold back the first three
 
@@ -61,7 +61,7 @@ class _Stream:
         self.last_s = lead_s
 
     def is_set(self, lead_s: float, newest_imu_s: float, imu_jump_s: float) -> bool:
-        """Whether an image shows that one of the clocks was set, or goes on to show it.
+        """Whether an image shows a step of one of the clocks, for the first time or like the image before.
 
         Args:
             lead_s: Of the image, s.

@@ -1,9 +1,9 @@
-"""Images of slow motion in turn: with all of them, noise of the gyro would pass for motion.
+"""Thins images of slow motion: with all of them, noise of the gyro would pass for motion.
 
-A time shift shows in how the rate changes from one image to the next, a lever arm in how that turns the rig.
-Rates and attitudes of a filter have the noise of the gyro. Squared, it counts as information: by 60 images a
-second at 12 deg/s the time shift seems known four times as well as by the Cramer-Rao bound, and stays where
-it began. The bound is the same for 20 images a second. [docs/math/filter.md, "Images of slow motion"]
+A time shift shows in how the rate changes from one image to the next, a lever arm in how the rig turns. Both
+are taken from the gyro, with its noise. Squared, this noise counts as information: with 60 images a second at
+12 deg/s, the sigma of the time shift is a quarter of the Cramer-Rao bound, and the estimate hardly moves. The
+bound is the same for 20 images a second. [docs/math/filter.md, "Images of slow motion"]
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.rates import RATE_BLOCK_S
 
 _TIMES = 2.0
-"""The rate changes by so many times its noise from one image to the next: the noise adds a quarter to the
-information, and the sigma is 12 % too small."""
+"""Change of the rate from one image to the next, over its noise. At 2 the noise adds a quarter to the
+information, so that sigmas are 11 % too small."""
 _LONGEST_S = 0.1  # between images: with fewer than ten a second other weaknesses of slow cameras show
 _LOOK_S = 1.0  # the motion is looked at so often
-_LATEST = 31  # intervals that tell the rate of a camera
+_LATEST = 31  # intervals of which the median is taken
 
 
 class ImagePace:
     """Chooses the images that are used, by how fast the rate changes.
 
     Args:
-        noise: Of the gyro, as stated.
+        noise: Densities as configured.
     """
 
     def __init__(self, noise: ImuNoise) -> None:
@@ -46,7 +46,7 @@ class ImagePace:
         Args:
             camera: Its name.
             t_cam_s: Stamp, s.
-            rate_change_rps2: See `RunningMotion`; None: not known yet.
+            rate_change_rps2: See `RunningMotion`, rad/s^2; None: not known yet.
             buffer: Inertial readings; None: there are none yet.
         """
         now_s = -np.inf if buffer is None else buffer.newest_s
@@ -60,8 +60,8 @@ def interval_s(noise: ImuNoise, rate_change_rps2: float, buffer: ImuBuffer) -> f
     """Interval between images in which the rate changes by `_TIMES` its noise, s.
 
     Args:
-        noise: Of the gyro, as stated.
-        rate_change_rps2: RMS change of the rate from one `RATE_BLOCK_S` to the next, over that time.
+        noise: Densities as configured.
+        rate_change_rps2: RMS change of the mean rate from one `RATE_BLOCK_S` to the next, over it, rad/s^2.
         buffer: Inertial readings.
     """
     rows = buffer.rows
@@ -94,7 +94,7 @@ class Thinning:
 
         Args:
             t_s: Its stamp, s, any origin, increasing.
-            least_s: Images wanted are so far apart, s.
+            least_s: Least interval between the images that are used, s.
         """
         if self._before_s is not None:
             self._intervals_s.append(t_s - self._before_s)

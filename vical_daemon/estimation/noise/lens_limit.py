@@ -26,7 +26,7 @@ def limit(camera: CameraState) -> FloatArray:
     Least squares of the lens to patches, eight by six over the image, that are each off by as much. It hardly
     depends on the lens: rounded to three digits, it rarely has to be computed again.
 
-    0 where no patch shows it: a lens that is far off may have rays for hardly any.
+    A number that no patch shows gets 0: a lens that is far off may have rays for hardly any of them.
     """
     return np.asarray(SYSTEMATIC_PX * np.linalg.norm(np.linalg.pinv(patches(camera)), axis=1))
 
