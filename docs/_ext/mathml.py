@@ -11,6 +11,11 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 
 _LOGGER = logging.getLogger(__name__)
+_AS_DOCUTILS_READS_IT = (
+    (r"\{align\*?\}", "{aligned}"),  # it has amsmath's `aligned` only
+    (r"(\\[dt]?frac) ?(\d)(\d)", r"\1{\2}{\3}"),  # it takes \tfrac12 b for 12 over b
+    (r"(\\(?:hat|bar|dot)(?:\{[^}]*\}|\\[a-z]+| ?[a-zA-Z]))_", r"\1{}_"),  # it sets \hat x_i below x
+)
 
 
 def _visit_inline(self: Any, node: nodes.math) -> None:
@@ -25,7 +30,9 @@ def _visit_block(self: Any, node: nodes.math_block) -> None:
 
 def _mathml(node: nodes.math | nodes.math_block, *, block: bool) -> str:
     """Translate a formula. One that docutils does not know is a warning, and `make docs` fails."""
-    latex = re.sub(r"\{align\*?\}", "{aligned}", node.astext())  # docutils has amsmath's `aligned` only
+    latex = node.astext()
+    for pattern, replacement in _AS_DOCUTILS_READS_IT:
+        latex = re.sub(pattern, replacement, latex)
     try:
         return str(latex2mathml.tex2mathml(latex, as_block=block))
     except MathError as error:

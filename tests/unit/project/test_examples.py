@@ -102,3 +102,19 @@ def test_reference_pages_cover_the_code(reference):
     modules = reference.modules_text()
     assert "`vical_drivers.clock`" in modules
     assert "`vical_daemon.results.report.writer`" in modules
+
+
+@pytest.mark.parametrize(
+    ("latex", "mathml"),
+    [
+        (r"\tfrac12 b", "<mn>1</mn><mn>2</mn></mfrac><mi>b</mi>"),
+        (r"\tfrac1{15} x", "<mn>1</mn><mn>15</mn></mfrac><mi>x</mi>"),
+        (r"\hat\nu_i^2", "</mover><msubsup><mrow></mrow><mi>i</mi><mn>2</mn></msubsup>"),
+    ],
+)
+def test_formulas_mean_on_the_pages_what_tex_makes_of_them(latex, mathml):
+    pytest.importorskip("sphinx", reason="the docs' packages are not installed")
+    from docutils import nodes
+
+    page = load(ROOT / "docs" / "_ext" / "mathml.py")._mathml(nodes.math(latex, latex), block=False)
+    assert mathml in "".join(page.split())
