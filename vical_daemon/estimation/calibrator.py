@@ -36,7 +36,7 @@ from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
-from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
+from vical_daemon.estimation.status.change_watch import Action, ChangeWatch, suspect
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import BEFORE_S, RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
@@ -81,7 +81,7 @@ class Calibrator:
         self._past = RecentPast()
         # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
         self._unproven: tuple[float, str, float] | None = None
-        self._sure_from_s = -np.inf  # from then on, what jumped is known for sure
+        self._sure_from_s = -np.inf  # until then it is not asked again what jumped
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
 
@@ -350,7 +350,7 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action in (Action.ASK, Action.POSE, Action.RESTART) and self._part_changed(f, frame.camera):
+        if action in (Action.ASK, Action.POSE, Action.RESTART) and self._part_changed(f, suspect(f, frame)):
             return
         if action is Action.POSE:
             self._lose_motion(jumped=True)
@@ -364,7 +364,7 @@ class Calibrator:
             self._restart(f)
 
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images no longer fit because something jumped; go on with that alone unknown."""
+        """See whether images no longer fit because something jumped; go on with all of that unknown."""
         assert self._buffer is not None
         if f.unobservable is not None or f.state.t_s < self._sure_from_s:
             return False

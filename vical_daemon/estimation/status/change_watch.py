@@ -17,6 +17,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import SURE
 from vical_daemon.estimation.noise.consistency import Consistency
@@ -93,6 +94,11 @@ class Action(Enum):
     RESTART = auto()
     SKEW = auto()
     WANDER = auto()
+
+
+def suspect(f: CalibrationFilter, frame: PointsFrame) -> str:
+    """Return the camera whose images fit least since the first sign of a change; at a tie that of `frame`."""
+    return max([frame.camera, *f.consistency], key=lambda name: f.consistency[name].suspicion)
 
 
 @dataclass(slots=True)
