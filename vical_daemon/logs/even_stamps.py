@@ -273,7 +273,8 @@ def _written_in_ns(t_ns: IntArray) -> int:
 
     Else 0. Stamps of a device are so if they were rounded to about its interval, or if it loses readings.
     """
-    intervals_ns: IntArray = np.diff(np.sort(t_ns))
+    ordered_ns = np.sort(t_ns)
+    intervals_ns: IntArray = ordered_ns[1:] - ordered_ns[:-1]
     shortest_ns = int(intervals_ns[intervals_ns > 0].min(initial=np.iinfo(np.int64).max))
     alike = (intervals_ns == shortest_ns).all() or (intervals_ns % shortest_ns).any()
     return shortest_ns if not alike and shortest_ns in _DECIMAL_NS else 0
