@@ -117,12 +117,14 @@ class MotionRestart:
         found = LinearMotion.between(buffer, t_s, R, state.gyro_bias)
         if found is None:
             return None
-        known = np.concatenate([np.zeros(3), state.gravity, np.zeros(3), state.accel_bias])
+        turned = _turned(float(t_s[0]), R[0], f, buffer) if self._jumped else None
+        gravity = state.gravity if turned is None else turned @ state.gravity
+        known = np.concatenate([np.zeros(3), gravity, np.zeros(3), state.accel_bias])
         start = linear_start(found, poses.p, np.ones(len(t_s)), unknown=[SPEED], known=known)
         wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
         elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)
         motion = MotionStart(float(t_s[0]), R[0], start.p_world_cam, start.v_world_imu, wide, elapsed_s)
-        return motion._replace(turned=_turned(motion, f, buffer)) if self._jumped else motion
+        return motion._replace(turned=turned)
 
     def _begins_well(self, f: CalibrationFilter) -> bool:
         """Begin with an image that shows the pose; False: none does so far, and better ones may come."""
@@ -151,14 +153,14 @@ class MotionRestart:
         return max(min(by_imu_s, by_camera_s), 0.0)
 
 
-def _turned(motion: MotionStart, f: CalibrationFilter, buffer: ImuBuffer) -> FloatArray | None:
-    """How attitudes by images differ from those by the imu since the motion was lost, shape (3, 3)."""
-    segment = buffer.segment(f.state.t_s, motion.t_s)
+def _turned(t_s: float, R: FloatArray, f: CalibrationFilter, buffer: ImuBuffer) -> FloatArray | None:
+    """How the attitude `R` by an image at `t_s` differs from that by the imu since the motion was lost."""
+    segment = buffer.segment(f.state.t_s, t_s)
     if segment is None:
         return None
     ahead = f.copy()
     ahead.predict(segment)
-    return np.asarray(motion.R_world_imu @ ahead.state.R_world_imu.T)
+    return np.asarray(R @ ahead.state.R_world_imu.T)
 
 
 def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> FloatArray:
