@@ -24,7 +24,7 @@ from vical_daemon.estimation.filter.image_update import (
     rows_of,
     solve,
 )
-from vical_daemon.estimation.filter.jump_scores import JumpScores
+from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
@@ -92,6 +92,7 @@ class CalibrationFilter:
         arm_scores: What it has given so far, 1/m and 1, shape (3 cameras + 1,); 0: nothing yet.
         by_clipping: See `Influence`, of the latest segment.
         jumps: Asked for while something has changed, and nobody knows what.
+        jumped: Likewise, of a copy that knows of a jump.
     """
 
     state: State
@@ -116,6 +117,7 @@ class CalibrationFilter:
     arm_scores: FloatArray | float = 0.0
     by_clipping: FloatArray | None = None
     jumps: JumpScores | None = None
+    jumped: JumpSizes | None = None
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -128,8 +130,10 @@ class CalibrationFilter:
         state = self.state
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
-        if self.jumps is not None:
-            self.jumps.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
+        for jumps in (self.jumps, self.jumped):
+            if jumps is not None:
+                jumps.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
+                self._drift(jumps.D, jumps.D, moved.seconds)
         self._grow(moved, Q)
         self._predict_score(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
@@ -416,11 +420,16 @@ class CalibrationFilter:
 
     def _drift_shifts(self, A: FloatArray, dt: float) -> None:
         """Let time shifts drift for `dt` seconds: nominal values, and their rows of the square root `A`."""
-        n = self.layout.size
+        self._drift(A[:, : self.layout.size], self.S, dt)
         for name, where in self.layout.cameras.items():
             if where.timeshift is not None and where.skew is not None:
-                A[where.timeshift, :n] += dt * self.S[where.skew]
                 self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+
+    def _drift(self, A: FloatArray, S: FloatArray, dt: float) -> None:
+        """Let errors of time shifts in `A` drift for `dt` seconds by those of the rates in `S`."""
+        for where in self.layout.cameras.values():
+            if where.timeshift is not None and where.skew is not None:
+                A[where.timeshift] += dt * S[where.skew]
 
     def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
         """A filter that can be run ahead of this one; what is measured about the noise stays shared.

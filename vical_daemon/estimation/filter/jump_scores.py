@@ -98,18 +98,55 @@ class JumpScores:
         explained = np.vecdot(b, np.linalg.solve(A, b[..., None])[..., 0])
         return np.asarray(0.5 * (explained - np.linalg.slogdet(A)[1]))
 
-    def sizes(self, part: slice, instant: int) -> FloatArray:
-        """By how much some directions jumped: root of the expected square, over one sigma, shape (q,).
-
-        Args:
-            part: Which of the directions.
-            instant: Index of the image after the jump.
-        """
-        A, b = (x[instant] for x in self._posterior(part))
-        covariance = np.linalg.inv(A)
-        return np.asarray(np.sqrt((covariance @ b) ** 2 + np.diag(covariance)))
-
     def _posterior(self, part: slice) -> tuple[FloatArray, FloatArray]:
         """Information, shape (k, q, q), and information vectors, shape (k, q), of a jump of one sigma."""
         b = self.weighted[:, part]
         return self.information[:, part, part] + unit(b.shape[1]), b
+
+
+@dataclass(slots=True)
+class JumpSizes:
+    """How far errors jumped, by a filter whose covariance contains the jump from its first image on.
+
+    A jump is known by the images only as far as the state is. So each correction of the state moves the
+    estimate of the jump by their regression, wherever the image was linearised.
+
+    Attributes:
+        D: Covariance of the state with the jump over its sigmas, shape (n, p).
+        mean: Of the jump over its sigmas, shape (p,).
+        covariance: Likewise, shape (p, p).
+    """
+
+    D: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, columns: FloatArray) -> JumpSizes:
+        """Just after `columns` were added to the covariance, shape (n, p)."""
+        p = columns.shape[1]
+        return cls(columns.copy(), np.zeros(p), np.eye(p))
+
+    def predict(self, linear: FloatArray, S: FloatArray) -> None:
+        """Propagate; arguments as for `JumpScores`."""
+        self.D[:9] = linear @ solve_lower(S, self.D[: len(S)])
+
+    def correct(self, before: FloatArray, after: FloatArray, dx: FloatArray) -> None:
+        """Take a correction of the state.
+
+        Args:
+            before: Square root of the covariance as predicted, shape (n, n).
+            after: Likewise, of the corrected state.
+            dx: Step of the state, shape (n,).
+        """
+        normal = solve_lower(before, np.concatenate([self.D, dx[:, None]], axis=1))
+        by_jump = normal[:, :-1]
+        left = after.T @ solve_lower(before, by_jump, transposed=True)
+        self.mean = self.mean + by_jump.T @ normal[:, -1]
+        self.covariance = self.covariance - by_jump.T @ by_jump + left.T @ left
+        self.D = after @ left
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Root of the expected square of each jump, over one sigma, shape (p,)."""
+        return np.asarray(np.sqrt(self.mean**2 + np.maximum(np.diag(self.covariance), 0.0)))

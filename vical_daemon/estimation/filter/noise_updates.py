@@ -19,7 +19,7 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     """Take what an image says about shared errors, lens and jumps.
 
     Args:
-        f: The filter, still as predicted; its `shared`, `agreement` and `jumps` learn.
+        f: The filter, still as predicted; its `shared`, `agreement`, `jumps` and `jumped` learn.
         image: The image.
         lin: The image about the prediction.
         fit: Its correction, not yet accepted.
@@ -29,6 +29,8 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     rows = whitened(image, lin, fit) if lin.curved.size else fit.rows
     if f.jumps is not None:
         f.jumps.update(rows, lin.by_error, lin.moves, f.S)
+    if f.jumped is not None:
+        f.jumped.correct(f.S, fit.S, fit.dx)
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)
     if shared is not None:
         ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.jump_scores import JumpScores
+from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
@@ -143,8 +143,8 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
         step: Takes an image with a filter.
     """
     odds = _ODDS * before.consistency[camera].strictness
-    none, instants, sizes = _suspects(before, images, camera, step, odds)
-    found: dict[Part, tuple[float, int]] = {}
+    none, refused, instants = _suspects(before, images, camera, step, odds)
+    found: dict[Part, _Jump] = {}
     filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
     for k, image in enumerate(images):
@@ -153,31 +153,54 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
             filters[k] = deepcopy(f)
         for part in parts:
             after = _follow_after(filters[k], {part: 1.0}, images[k:], camera, step)
-            found[part] = max(found.get(part, (none, -1)), (likelihood + after.likelihood, k))
+            jump = _Jump(likelihood + after.likelihood, k, after.sizes)
+            if jump.likelihood > found.get(part, _Jump(none)).likelihood:
+                found[part] = jump
         likelihood += _follow(f, image, step)[0]
     if not found:
         return Found(Part.NONE, frozenset(), before)
-    best = max(found, key=lambda part: found[part][0])
-    total, k = found[best]
-    possible = {part for part, (other, at) in found.items() if at >= 0 and other > total - odds}
+    best = max(found, key=lambda part: found[part].likelihood)
+    total, k, _ = found[best]
+    possible = {part for part, other in found.items() if other.likelihood > total - odds}
     if total > none + odds and possible == {Part.TARGET}:
         return Found(best, frozenset(possible), filters[k])
     if total > none + odds:
-        unknown = {part: sizes(part, k) for part in possible}
+        unknown = {part: found[part].sizes for part in possible}
         after = _follow_after(filters[k], unknown, images[k:], camera, step)
         for consistency in after.filter.consistency.values():
             consistency.settle()
-        if 2 * after.used > len(images) - k:
+        if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
             return Found(best, frozenset(possible), after.filter)
     return Found(Part.NONE, frozenset(), before)
 
 
+def _most(used: Sequence[bool]) -> bool:
+    """Whether more than half of some images were used, or there are none."""
+    return not used or 2 * sum(used) > len(used)
+
+
+class _Jump(NamedTuple):
+    """A jump just before an image: log-likelihood of all images, which image, and `_After.sizes`."""
+
+    likelihood: float
+    at: int = -1
+    sizes: FloatArray = np.ones(0)
+
+
 class _After(NamedTuple):
-    """A filter after images, their log-likelihood, and how many of them it used."""
+    """A filter after images to which parts are unknown.
+
+    Attributes:
+        filter: It.
+        likelihood: Logarithm of the likelihood of the images.
+        used: Which of them it used.
+        sizes: By how much these parts jumped: root of the expected square, over one sigma, shape (q,).
+    """
 
     filter: CalibrationFilter
     likelihood: float
-    used: int
+    used: Sequence[bool]
+    sizes: FloatArray
 
 
 def _follow_after(
@@ -197,11 +220,14 @@ def _follow_after(
         step: Takes an image with a filter.
     """
     f, jumps = deepcopy(before), _jumps(before, camera)
-    f.inflate_covariance(np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1))
+    columns = np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1)
+    f.inflate_covariance(columns)
+    f.jumped = jumped = JumpSizes.of(columns)
     if Part.LENS in parts:  # what stretches of the data said about it no longer holds
         f.agreement[camera] = LensAgreement(f.agreement[camera].model)
     likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
-    return _After(f, sum(likelihoods), sum(used))
+    f.jumped = None
+    return _After(f, sum(likelihoods), used, jumped.sizes)
 
 
 def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
@@ -212,7 +238,7 @@ def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: st
 
 def _suspects(
     before: CalibrationFilter, images: Frames, camera: str, step: Step, odds: float
-) -> tuple[float, dict[Part, set[int]], Callable[[Part, int], FloatArray]]:
+) -> tuple[float, list[int], dict[Part, set[int]]]:
     """Find what may have jumped, and when.
 
     Args:
@@ -223,28 +249,29 @@ def _suspects(
         odds: By how much a jump must be more likely than none, in logarithms.
 
     Returns:
-        Log-likelihood of the images without a jump; by part, the images just before which it may have jumped,
-        nothing where no jump is likely; how far a part jumped just before an image, over one sigma.
+        Log-likelihood of the images without a jump, and those that are refused; by part, the images just
+        before which it may have jumped, nothing where no jump is likely.
     """
     f = deepcopy(before)
     f.jumps = scores = JumpScores.of(len(f.S), sum(x.shape[1] for x in _jumps(f, camera).values()))
-    likelihood, refused, fits = 0.0, set[int](), True
+    likelihood, refused, fits = 0.0, list[int](), True
     for k, (t_cam_s, frame) in enumerate(images):
         jumps = _jumps(f, camera)
         scores.begin(np.concatenate(list(jumps.values()), axis=1))
         report = step(f, frame, t_cam_s)
         likelihood += 0.0 if report is None else report.log_likelihood
         fits = report is None or report.used
-        if not fits and not refused:
-            refused.add(k)  # rejected images are not in the scores; a large jump may be just before the first
+        if not fits:
+            refused.append(k)
     ends = np.cumsum([x.shape[1] for x in jumps.values()])
     own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps.items(), ends, strict=True)}
     ratios = {part: scores.log_ratios(of) for part, of in own.items()}
     if fits and max(x.max() for x in ratios.values()) < odds:
-        return likelihood, {}, lambda part, k: scores.sizes(own[part], k)
+        return likelihood, refused, {}
     best = {part: int(x.argmax()) for part, x in ratios.items()}
-    instants = {part: {k - 1, k, k + 1} | refused for part, k in best.items()}
-    return likelihood, instants, lambda part, k: scores.sizes(own[part], k)
+    # images that are refused tell the scores nothing; a large jump may be just before the first of them
+    instants = {part: {k - 1, k, k + 1, *refused[:1]} for part, k in best.items()}
+    return likelihood, refused, instants
 
 
 def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.filter.jump_scores import JumpScores
+from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 
 IMAGES, SIGMA = 12, np.array([0.7, 0.4])
 
@@ -54,3 +54,28 @@ def test_ratios_are_those_of_filters_that_know_of_the_jump(problem):
     ratios = scores.log_ratios(slice(0, 2))
     expected = [run(F, images, k)[0] - without for k in range(IMAGES)]
     assert ratios == pytest.approx(expected, abs=1e-9)
+
+
+def test_sizes_are_those_of_a_filter_that_estimates_the_jump(problem):
+    F, images = problem
+    columns = np.zeros((12, 2))
+    columns[[9, 11], [0, 1]] = SIGMA
+    P = 0.25 * np.eye(12) + columns @ columns.T
+    joint = np.block([[P, columns], [columns.T, np.eye(2)]])  # of the state after the jump, and the jump
+    mean = np.zeros(14)
+    jumped = JumpSizes.of(columns)
+    motion = np.eye(14)
+    motion[:12, :12] = F
+    for ways, by_error, z in images:
+        L = np.linalg.cholesky(joint[:12, :12])
+        H = np.concatenate([ways @ by_error, np.zeros((5, 2))], axis=1)
+        r = z - H @ mean
+        K = joint @ H.T @ np.linalg.inv(np.eye(5) + H @ joint @ H.T)
+        mean, joint = mean + K @ r, joint - K @ H @ joint
+        dx, after = (K @ r)[:12], np.linalg.cholesky(joint[:12, :12])
+        jumped.correct(L, after, dx)
+        L = after
+        jumped.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
+        mean, joint = motion @ mean, motion @ joint @ motion.T
+    expected = np.sqrt(mean[12:] ** 2 + np.diag(joint)[12:])
+    assert jumped.sizes == pytest.approx(expected, abs=1e-9)
