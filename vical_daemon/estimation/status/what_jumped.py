@@ -46,18 +46,19 @@ Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
 class Part(Enum):
-    """What may jump: mountings, each by itself (MOUNTING) or all alike (IMU), the target, or other parts."""
+    """What may jump: a mounting, all of them each by itself or all alike (IMU), the target, other parts."""
 
     NONE = auto()
     SHIFT = auto()
     DRIFT = auto()
     MOUNTING = auto()
+    MOUNTINGS = auto()
     IMU = auto()
     LENS = auto()
     TARGET = auto()
 
 
-MOVED = frozenset({Part.MOUNTING, Part.IMU})
+MOVED = frozenset({Part.MOUNTING, Part.MOUNTINGS, Part.IMU})
 """What is announced as a bump."""
 
 
@@ -69,17 +70,22 @@ def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
         out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [_SHIFT_S])
     if where.skew is not None:
         out[Part.DRIFT] = _columns(layout.size, [where.skew], [SKEW_SIGMA])
-    turns = [k for c in layout.cameras.values() if c.rotation is not None for k in every[c.rotation]]
-    moves = [k for c in layout.cameras.values() if c.position is not None for k in every[c.position]]
-    if turns or moves:
-        sigmas = np.repeat([_TURN_RAD, _MOVE_M], [len(turns), len(moves)])
-        out[Part.MOUNTING] = _columns(layout.size, turns + moves, sigmas)
+    mountings = {
+        name: [*every[c.rotation], *every[c.position]]
+        for name, c in layout.cameras.items()
+        if c.rotation is not None and c.position is not None
+    }
+    sigmas = np.repeat([_TURN_RAD, _MOVE_M], 3)
+    if camera in mountings:
+        out[Part.MOUNTING] = _columns(layout.size, mountings[camera], sigmas)
     if where.intrinsics is not None and layout.lens_free(camera):
         focal = float(f.state.cameras[camera].intrinsics[0])
         out[Part.LENS] = _columns(
             layout.size, every[where.intrinsics], focal * np.repeat([_ZOOM, _SHIFTED], 2)
         )
-    if len(layout.cameras) > 1 and turns and moves:
+    if len(mountings) > 1:
+        errors = [k for own in mountings.values() for k in own]
+        out[Part.MOUNTINGS] = _columns(layout.size, errors, np.tile(sigmas, len(mountings)))
         out[Part.IMU] = _imu_moves(f.state, layout)
     out[Part.TARGET] = _target_moves(f.state, layout.size)
     return out
@@ -162,6 +168,8 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
     best = max(found, key=lambda part: found[part].likelihood)
     total, k, _ = found[best]
     possible = {part for part, other in found.items() if other.likelihood > total - odds}
+    if possible & {Part.MOUNTING, Part.IMU}:  # which are special cases of it
+        possible.discard(Part.MOUNTINGS)
     if total > none + odds and possible == {Part.TARGET}:
         return Found(best, frozenset(possible), filters[k])
     if total > none + odds:
