@@ -470,7 +470,7 @@ class Calibrator:
                 f.reopen(where.timeshift, abs(self._intake.imu_stepped_s))
         self._intake.next_recording()
         self._pending = FrameQueue(list(self.rig.priors))
-        self._past, self._unproven = RecentPast(), None
+        self._past, self._unproven, self._sure_from_s = RecentPast(), None, -np.inf
         self._used_ns.clear()
         self._seek_shift.clear()
         self._initializer.anew()

@@ -177,7 +177,7 @@ class StatusEvaluator(Evaluator):
                 reported = reported._replace(guidance=self._cover.advice())
         if f is None and stale is not None and self._ever_converged:
             self._before = self._before or cameras
-        elif f is not None and self._before:
+        elif f is not None and self._before and cameras.keys() >= self._before.keys():  # none is absent
             self._report_change(cameras, f.state.t_s)
         return self._put_together(
             reported,

@@ -106,3 +106,14 @@ def test_the_camera_that_changed_is_named_not_the_one_whose_image_came_last(chan
     assert c.estimate().status == Status.CONVERGED
     for camera in c.estimate().cameras.values():
         assert np.linalg.norm(np.subtract(camera.T_imu_cam.p_m, run.rig.p_imu_cam)) < 1.5e-3
+
+
+def test_a_camera_that_is_absent_after_a_new_start_is_not_compared() -> None:
+    """`estimate` had ended with a KeyError if calibration went on without a camera that was bumped."""
+    run = simulate(31, 8.0, rig=reference_rig(31))
+    prior = camera_prior(run, 31, StartErrors(), exact_lens=True)
+    subject = CalibratorSubject(CalibrationOptions(), prior, run.points_m)
+    feed(run, subject)
+    evaluator, known = subject.calibrator.evaluator, subject.calibrator.estimate().cameras
+    evaluator._before = {"cam0": known["cam0"], "cam1": known["cam0"]}
+    assert list(subject.calibrator.estimate().cameras) == ["cam0"]
