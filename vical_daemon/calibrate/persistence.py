@@ -232,24 +232,34 @@ class CalibrationPersistence:
             return "the serial numbers of the devices are not known"
         return ""
 
-    def discard(self) -> dict[str, CameraPrior]:
-        """Put back what was stored when this calibration began (nothing, if nothing was).
+    def discard(self, estimate: CalibrationEstimate | None) -> dict[str, CameraPrior] | None:
+        """Put back what was stored when this calibration began, if anything was; announce the outcome.
+
+        Args:
+            estimate: The present result.
 
         Returns:
-            The prior of each camera for a new start.
+            The prior of each camera for a new start; None: nothing was discarded, go on.
         """
+        why = "" if estimate is not None and estimate.cameras else "there is no result yet"
         try:
             for name in self._config.calibration_cameras:
                 imu, camera = self._pair(name)
                 before = self._before.get(name)
+                if not (imu and camera) or self._serials.in_doubt or self._load(name) == before:
+                    continue
+                why = ""
                 if before is not None:
                     self._store.save(imu, camera, name, before.estimate, before.saved_ns)
-                elif imu and camera and not self._serials.in_doubt:
+                else:
                     self._store.remove(imu, camera)
-            said = "discarded: starting over, with what was stored before"
         except StoreError as error:
-            said = f"discarded, but the store was not put back: {error}"
-        self.announce(Event(EventKind.OTHER, said=said))
+            why = str(error)
+        if why:
+            self.announce(Event(EventKind.OTHER, said=f"not discarded: {why}"))
+            return None
+        which = "with what was stored before" if self._before else "nothing was stored before"
+        self.announce(Event(EventKind.OTHER, said=f"discarded: starting over, {which}"))
         self._compared.clear()
         self._status, self._saved_s = None, -float("inf")
         return self.priors(wait_s=0.0)

@@ -97,9 +97,10 @@ def calibrate(
         words = _commands(commands)
         if "accept" in words and persistence.accept(role.latest):
             publish(bus, persistence.stored_messages())
-        if words & {"discard", "reset"}:
+        discarded = persistence.discard(role.latest) if "discard" in words else None
+        if discarded is not None or "reset" in words:
             _log.info("starting over by command")
-            priors = persistence.discard() if "discard" in words else priors
+            priors = discarded or priors
             supervisor.start_over(make_estimator(config, priors))
         if persistence.replaced:
             priors = persistence.begin_again()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import signal
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -25,10 +26,11 @@ WORDS = {  # role and word on the bus
     "record-start": ("record", "start"),
     "record-stop": ("record", "stop"),
 }
-_ANSWERED = ("accept", "discard")
+_ANSWERED = {"accept": ("accepted", "not accepted"), "discard": ("discarded", "not discarded")}
 _OF_VERIFY = ("check", "calibrate", "verify")  # have an effect only with `mode: verify`
 _BUS_S = 3.0
-_ANSWER_S = 5.0  # estimates come five times a second, also from a busy machine
+_ANSWER_S = 5.0  # estimates come five times a second
+_BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.role`
 _EPILOG = """\
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began
@@ -97,7 +99,7 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
     came = threading.Event()
 
     def listen(sample: Sample) -> None:
-        found = _answer(sample)
+        found = _answer(sample, word)
         if found:
             answers.append(found)
             came.set()
@@ -109,7 +111,11 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
         if word not in _ANSWERED:
             return f"sent: {word} to {rig}"
         if not came.wait(answer_s):
-            raise CliError(f"no answer from {rig}: is the role estimate (vical-calibrate) running?")
+            if not bus.latest(topics.STATUS.key(rig, role)):
+                raise CliError(f"no answer from {rig}: is the role estimate (vical-calibrate) running?")
+            print(f"vical: {rig} is busy: waiting for its answer", file=sys.stderr)
+            if not came.wait(_BUSY_S):
+                raise CliError(f"no answer from {rig}: it may still {word}, see `vical watch`")
     finally:
         subscription.close()
     return answers[0]
@@ -138,7 +144,7 @@ def _check_effect(bus: Bus, rig: str, word: str) -> None:
         )
 
 
-def _answer(sample: Sample) -> str:
+def _answer(sample: Sample, word: str) -> str:
     """Return the answer to a command in an estimate; empty: it has none."""
     from vical_daemon.bus.messages import MessageError, decode_calibration
     from vical_daemon.estimation.wording import event_text
@@ -148,7 +154,7 @@ def _answer(sample: Sample) -> str:
     except MessageError:
         return ""
     texts = [event_text(event) for event in events]
-    return next((t for t in texts if t.startswith(("accepted", "not accepted", "discarded"))), "")
+    return next((text for text in texts if text.startswith(_ANSWERED[word])), "")
 
 
 def _rig(bus: Bus) -> str:

@@ -7,7 +7,6 @@ target is not in view. So some images are compared with boards that differ from 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -27,15 +26,17 @@ MAX_MISFIT = 0.03
 images it is at most 0.02, also with a fisheye lens; with a wrong number of columns it is 1 to 3."""
 SPACING_ERROR = 0.01
 """Least difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
-_FIRST, _EVERY, _RARER = 10, 20, 0.25
-"""The first image that is checked; images from one check to the next; the same as a share of all images so
-far. So a camera that waits all day for its board spends no time on checks."""
+_FIRST, _EVERY = 10, 30
+"""The first image that is checked, and how many lie between a finding and its confirmation; images from one
+check to the next. A check costs up to 0.3 s, the search for a board that is not there 20 ms an image."""
 _TAGS_A_TURN = 4  # kinds of tags that one image is searched for
 _MAX_COLS = 30  # of boards that are tried
 _SPACINGS = np.geomspace(0.02, 2.0, 24)  # gaps over tags that are tried first
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # of a tag, in edges
-# Added to the stated columns and rows: squares were counted, or one less than corners, or one is miscounted.
-_OTHER_COUNTS = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2))
+_SMALLEST, _ANY_COUNTS = (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+_GOES_ON = (
+    0.3  # of the contrast of the squares, by which what lies around them alternates where a board goes on
+)
 _FAMILIES = {
     "AprilTag 36h11": cv2.aruco.DICT_APRILTAG_36h11,
     "AprilTag 36h10": cv2.aruco.DICT_APRILTAG_36h10,
@@ -77,8 +78,8 @@ class TargetCheck:
         self._taken += 1
         if self._settled or self._taken < self._next:
             return
-        self._next = self._taken + max(_EVERY, round(_RARER * self._taken))
         text = contradiction(gray, self._target, self._turn)
+        self._next = self._taken + (_FIRST if text else _EVERY)
         if text is None:
             self._turn += 1
             return
@@ -100,9 +101,9 @@ def contradiction(gray: Gray, target: Target, turn: int = 0) -> str | None:
     if isinstance(target, Checkerboard):
         if len(ids) >= MIN_TAGS:
             return "AprilTags are in view, the target file states a checkerboard"
-        return _other_counts(gray, target, turn)
+        return _other_counts(gray, target)
     if len(ids) < MIN_TAGS:
-        return _other_tags(gray, turn)
+        return _other_tags(gray, turn // 2) if turn % 2 else _no_tags(gray)
     last = target.first_tag + target.tag_cols * target.tag_rows - 1
     if np.count_nonzero((ids < target.first_tag) | (ids > last)) > 0.5 * len(ids):
         return (
@@ -188,15 +189,63 @@ def _other_tags(gray: Gray, turn: int) -> str | None:
     return None
 
 
-def _other_counts(gray: Gray, target: Checkerboard, turn: int) -> str | None:
+def _no_tags(gray: Gray) -> str | None:
+    found = _board_in_view(gray)
+    if found is None:
+        return None
+    return (
+        f"a checkerboard with {found[0]} x {found[1]} inner corners is in view, the target file states an "
+        "aprilgrid: give its target file (`target_type: checkerboard`)"
+    )
+
+
+def _board_in_view(gray: Gray) -> tuple[int, int] | None:
+    """Return the counts of inner corners of a whole checkerboard, the larger first; None: no board.
+
+    A board that may go on beyond the border of the image, or whose squares do not alternate, is none.
+    """
     from vical_daemon.vision.detector import BoardDetector
 
-    more = _OTHER_COUNTS[turn % len(_OTHER_COUNTS)]
-    cols, rows = target.cols + more[0], target.rows + more[1]
-    if min(cols, rows) < 3:
+    found, corners, squares = cv2.findChessboardCornersSBWithMeta(gray, _SMALLEST, _ANY_COUNTS)
+    if not found:
         return None
-    if BoardDetector(replace(target, cols=cols, rows=rows), guided=False).detect(gray) is None:
+    rows, cols = squares.shape
+    if not _ends_in_view(np.asarray(corners, np.float64).reshape(rows, cols, 2), gray):
         return None
+    board = Checkerboard(max(cols, rows), min(cols, rows), 1.0, 1.0)
+    if BoardDetector(board, guided=False).detect(gray) is None:
+        return None
+    return board.cols, board.rows
+
+
+def _ends_in_view(grid: FloatArray, gray: Gray) -> bool:
+    """Whether what surrounds the outer squares is in the image, and no further row or column of squares.
+
+    Args:
+        grid: Inner corners, px, shape (rows, cols, 2).
+        gray: The image.
+    """
+    image = SaddleImage(gray)
+    inside = image.levels((grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4)
+    row, col = np.indices(inside.shape)
+    contrast = abs(float(np.mean(np.where((row + col) % 2, 1.0, -1.0) * (inside - inside.mean()))))
+    for side in (grid, grid[::-1], grid.swapaxes(0, 1), grid.swapaxes(0, 1)[::-1]):
+        edge, inner = ((line[1:] + line[:-1]) / 2 for line in side[:2])
+        beyond = edge + 1.5 * (edge - inner)  # middles of the squares that a larger board would have there
+        if not np.all((beyond >= 0) & (beyond < gray.shape[1::-1])):
+            return False
+        levels = image.levels(beyond)
+        signs = np.where(np.arange(len(levels)) % 2, 1.0, -1.0)
+        if abs(float(np.mean(signs * (levels - levels.mean())))) > _GOES_ON * contrast:
+            return False
+    return True
+
+
+def _other_counts(gray: Gray, target: Checkerboard) -> str | None:
+    found = _board_in_view(gray)
+    if found is None or found == (max(target.cols, target.rows), min(target.cols, target.rows)):
+        return None
+    cols, rows = found if target.cols >= target.rows else found[::-1]
     return (
         f"a checkerboard with {cols} x {rows} inner corners is in view, the target file states "
         f"{target.cols} x {target.rows}: count inner corners, one less than squares"

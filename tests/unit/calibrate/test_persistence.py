@@ -311,7 +311,7 @@ def test_discard_puts_back_what_was_stored_before(config: Config) -> None:
     persistence.priors()
     persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03))))  # converged: stored by itself
     assert _later(config).priors()["cam0"].T_imu_cam[1][0] == 0.09
-    assert persistence.discard()["cam0"].T_imu_cam[1][0] == 0.08
+    assert persistence.discard(_estimate(_camera()))["cam0"].T_imu_cam[1][0] == 0.08
     assert _later(config).priors()["cam0"].T_imu_cam[1][0] == 0.08
 
 
@@ -319,5 +319,38 @@ def test_discard_forgets_where_nothing_was_stored_before(config: Config) -> None
     persistence = _later(config)
     persistence.priors()
     persistence.watch(_estimate(_camera()))
-    assert persistence.discard()["cam0"].T_imu_cam is None
+    assert persistence.discard(_estimate(_camera()))["cam0"].T_imu_cam is None
     assert _later(config).priors()["cam0"].T_imu_cam is None
+    said = _said(persistence, _estimate(_camera(), Status.WAITING))
+    assert said == ["discarded: starting over, nothing was stored before"]
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_without_a_result_nothing_is_discarded_and_it_is_said(config: Config, before: bool) -> None:
+    if before:
+        _remember(config, _camera())
+    persistence = _later(config)
+    persistence.priors()
+    waiting = replace(_estimate(_camera(), Status.WAITING), cameras={})
+    for estimate in (None, waiting):
+        assert persistence.discard(estimate) is None
+        assert _said(persistence, waiting) == ["not discarded: there is no result yet"]
+    persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03))))  # stored; then the estimator failed
+    assert persistence.discard(None) is not None
+    assert (_later(config).priors()["cam0"].T_imu_cam is not None) == before
+
+
+def test_a_store_that_cannot_be_put_back_is_no_success(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    persistence = _later(config)
+    persistence.priors()
+    persistence.watch(_estimate(_camera()))
+
+    def refuse(*_: object) -> None:
+        raise StoreError("x.json cannot be removed: Read-only file system")
+
+    monkeypatch.setattr(CalibrationStore, "remove", refuse)
+    assert persistence.discard(_estimate(_camera())) is None
+    said = _said(persistence, _estimate(_camera(), Status.WAITING))
+    assert said == ["not discarded: x.json cannot be removed: Read-only file system"]

@@ -112,7 +112,7 @@ def test_another_device_begins_anew_and_is_told(running):
 
 
 @pytest.mark.parametrize(
-    ("word", "answer"), [("accept", "not accepted: there is no"), ("discard", "discarded")]
+    ("word", "answer"), [("accept", "not accepted: there is no"), ("discard", "not discarded: there is no")]
 )
 def test_a_command_is_answered_on_the_bus_and_in_the_terminal(running, word, answer):
     running.until(lambda: running.counts and running.counts[-1] > 100)

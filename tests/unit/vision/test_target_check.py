@@ -45,12 +45,36 @@ def test_lens_size_and_part_of_the_board_do_not_matter(film, fisheye):
 @pytest.mark.parametrize(("cols", "rows"), [(9, 8), (7, 6), (9, 7)])
 def test_squares_counted_for_corners(film, cols, rows):
     stated = replace(BOARD, cols=cols, rows=rows)
-    turn = [(x + cols, y + rows) for x, y in target_check._OTHER_COUNTS].index((8, 7))
-    said = contradiction(film(BOARD, 0.7).render(0.0), stated, turn)
+    said = contradiction(film(BOARD, 0.7).render(0.0), stated)
     assert said == (
         f"a checkerboard with 8 x 7 inner corners is in view, the target file states {cols} x {rows}: "
         "count inner corners, one less than squares"
     )
+
+
+@pytest.mark.parametrize(
+    ("board", "distance_m"), [(BOARD, 0.9), (Checkerboard(9, 6, 0.06, 0.06), 1.4), (BOARD, 2.0)]
+)
+def test_a_checkerboard_of_any_counts_in_place_of_tags_or_another_one(film, board, distance_m):
+    camera = film(board, distance_m, exposure_s=0.003)
+    text = f"a checkerboard with {board.cols} x {board.rows} inner corners is in view, the target file states"
+    for stated, what in ((GRID, "an aprilgrid: "), (Checkerboard(11, 5, 0.05, 0.05), "11 x 5: ")):
+        said = [contradiction(camera.render(0.4 * k), stated) for k in range(3)]
+        assert set(said) <= {None, said[0]} and said.count(said[0]) >= 2
+        assert said[0] is not None and said[0].startswith(f"{text} {what}")
+
+
+def test_a_part_of_a_board_is_no_other_board(film):
+    """Neither one that the image cuts off nor one that a hand hides from there on."""
+    camera = film(BOARD, 0.7)
+    picture = camera.render(0.0)
+    u = camera.project(BOARD.points_m, 0.0)[0][:, 0].reshape(BOARD.rows, BOARD.cols)
+    cut = round(float(np.mean(u[:, -2:])))  # between the last two columns of corners
+    left = np.ascontiguousarray(picture[:, :cut])
+    hidden = picture.copy()
+    hidden[: picture.shape[0] // 3] = 90
+    assert contradiction(picture, GRID) is not None
+    assert {contradiction(part, target) for part in (left, hidden) for target in (GRID, BOARD)} == {None}
 
 
 def test_tags_of_another_family():
@@ -59,14 +83,14 @@ def test_tags_of_another_family():
     for k in range(12):
         u, v = 40 + 140 * (k % 4), 30 + 140 * (k // 4)
         picture[v : v + 100, u : u + 100] = cv2.aruco.generateImageMarker(family, k, 100)
-    said = [contradiction(picture, GRID, turn) for turn in range(4)]
+    said = [contradiction(picture, GRID, turn) for turn in range(9)]
     assert any(text and "family AprilTag 25h9 with a border of 1 bits" in text for text in said)
 
 
 def test_an_empty_scene_says_nothing():
     picture = np.random.default_rng(0).integers(0, 255, (120, 160), np.uint8)
     picture = cv2.resize(picture, (640, 480), interpolation=cv2.INTER_CUBIC)
-    assert {contradiction(picture, target, turn) for target in (GRID, BOARD) for turn in range(4)} == {None}
+    assert {contradiction(picture, target, turn) for target in (GRID, BOARD) for turn in range(9)} == {None}
 
 
 def test_two_pictures_must_agree_and_it_is_told_once(film):
@@ -77,7 +101,7 @@ def test_two_pictures_must_agree_and_it_is_told_once(film):
     for k in range(80):
         assert detector.detect(camera.render(0.02 * k), 20_000_000 * k) is not None
         counts.append(len(told))
-    assert counts.index(1) == target_check._FIRST + target_check._EVERY - 1 and counts[-1] == 1
+    assert counts.index(1) == 2 * target_check._FIRST - 1 and counts[-1] == 1
 
 
 def test_a_board_that_fits_is_looked_at_once(film, monkeypatch):
@@ -89,10 +113,10 @@ def test_a_board_that_fits_is_looked_at_once(film, monkeypatch):
     assert len(looks) == 1
 
 
-def test_a_day_without_a_board_costs_little(monkeypatch):
+def test_without_a_board_the_checks_go_on_and_cost_little(monkeypatch):
     looks: list[int] = []
     monkeypatch.setattr(target_check, "contradiction", lambda *_: looks.append(1))
     check = TargetCheck(GRID, lambda text: pytest.fail(text))
-    for _ in range(1_000_000):
+    for _ in range(10_000):
         check.take(np.zeros((4, 4), np.uint8), found=False)
-    assert 10 < len(looks) < 60
+    assert 300 <= len(looks) <= 340  # a board that comes into view after minutes is told of within seconds
