@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.cli.imu_data import EvenSamples
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
         length = _length(samples.duration_s)
         note = f"vical allan {Path(args.input).name}: {length} at {samples.rate_hz:.2f} Hz"
-        Path(args.output).write_text(write_imu(combined, note=note), encoding="utf-8")
+        write_output(Path(args.output), write_imu(combined, note=note))
     if args.plots:
         from vical_daemon.cli.allan_plots import write_plots
 

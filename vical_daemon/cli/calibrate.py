@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json, add_sensors, add_stretch, suggest, warn
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.result import CalibrationEstimate
@@ -167,7 +168,7 @@ def write(
     """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
     text = json.dumps(finite(result), allow_nan=False)
     if args.output and result["cameras"]:  # a failure must not replace an earlier result
-        Path(args.output).write_text(text + "\n", encoding="utf-8")
+        write_output(Path(args.output), text + "\n")
     if args.json:
         print(text)
         return

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_drivers.samples import Frame, FrameSource
@@ -313,7 +314,7 @@ def _snapshot(args: argparse.Namespace) -> int:
             pass
     if frame is None:
         raise CliError(f"{args.device}: no frame")
-    path.write_bytes(encode_image(frame.image, kinds[path.suffix.lower()]))
+    write_output(path, encode_image(frame.image, kinds[path.suffix.lower()]))
     if args.json:
         print(json.dumps({"file": str(path), **_facts(frame)}))
     else:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json, check_port
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.cli.demo_screen import Watch
@@ -115,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
         if not args.json:
             _print_text(result, demo_truth.as_text(table))
     text = json.dumps(result)
-    (out / "result.json").write_text(text + "\n", encoding="utf-8")
+    write_output(out / "result.json", text + "\n")
     if args.json:
         print(text)
     busy = _busy(result)

@@ -24,7 +24,8 @@ NOTHING_TO_RUN = "neither imus nor cameras: there is nothing to run (`vical devi
 
 _OURS = ("vical_daemon", "vical_drivers", "vical_mocks")
 _REFUSALS = {
-    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EMFILE, errno.ENFILE,
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ENODEV, errno.ENXIO,
+    errno.EMFILE, errno.ENFILE,
 }  # fmt: skip
 """What disks and devices refuse with: no bug, even where the system does not name the file."""
 _log = logging.getLogger(__name__)

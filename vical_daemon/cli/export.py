@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.results.export import ExportFile, Rig
@@ -104,7 +105,7 @@ def write_files(files: list[ExportFile], output: Path) -> list[Path]:
     paths = []
     for number, file in enumerate(files):
         path = output if number == 0 and not folder else parent / file.name
-        path.write_text(file.text, encoding="utf-8")
+        write_output(path, file.text)
         paths.append(path)
     return paths
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import add_input
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.tools.imu_static import ImuCalibration, SensorCalibration
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     found = calibrate_imu(samples.gyro_rps, samples.accel_mps2, samples.rate_hz, args.gravity, args.min_rest)
     document = to_document(found)
     if args.output:
-        Path(args.output).write_text(to_yaml(document, f"vical imu-calibrate {Path(args.input).name}"))
+        write_output(Path(args.output), to_yaml(document, f"vical imu-calibrate {Path(args.input).name}"))
     if args.json:
         print(json.dumps(document))
     else:

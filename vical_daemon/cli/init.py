@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.cli.check import Finding
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         loads(text, str(args.output))
     except ConfigError as error:  # --rig, or what a device says of itself
         raise CliError(str(error), EXIT_USAGE) from None
-    args.output.write_text(text, encoding="utf-8")
+    write_output(args.output, text)
     _say(args, f"wrote {args.output}" + (f" (target: {target})" if target else ""))
     if target is None:
         _say(args, "no board: calibrates from what the camera sees. With one: vical init --target aprilgrid")
@@ -132,7 +133,7 @@ def _make_target(args: argparse.Namespace, folder: Path) -> str:
         from vical_daemon.vision.target import Checkerboard
 
         board = Checkerboard(**BOARD)  # type: ignore[arg-type]
-        (folder / _TARGET_FILE).write_text(board.to_yaml(), encoding="utf-8")
+        write_output(folder / _TARGET_FILE, board.to_yaml())
         return _TARGET_FILE
     from vical_daemon.cli import target
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.vision.target import Target
@@ -128,11 +129,11 @@ def make(args: argparse.Namespace) -> Made:
     write_yaml = _must_write(args, yaml_path, target)
     try:
         if kind == ".pdf":
-            args.out.write_bytes(to_pdf(sheet, describe(target)))
+            write_output(args.out, to_pdf(sheet, describe(target)))
         else:
-            args.out.write_text(to_svg(sheet), encoding="utf-8")
+            write_output(args.out, to_svg(sheet))
         if write_yaml:
-            yaml_path.write_text(target.to_yaml(), encoding="utf-8")
+            write_output(yaml_path, target.to_yaml())
     except OSError as error:
         raise CliError(f"{error.filename or args.out}: cannot be written ({error.strerror})") from None
     return Made(target, sheet.size_mm, yaml_path, describe(target).removeprefix("vical "))

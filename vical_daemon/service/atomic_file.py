@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -33,3 +35,38 @@ def atomic_write(path: Path, data: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def write_output(path: Path, data: str | bytes) -> None:
+    """Write a file that a person asked for; a disk that is full leaves the earlier one as it was.
+
+    Pipes and devices are written to, and links followed. The mode of an earlier file is kept.
+
+    Args:
+        path: The file.
+        data: Its content; text becomes UTF-8.
+
+    Raises:
+        OSError: It cannot be written, or its folder is missing; names the file.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    place = path.resolve()
+    try:
+        before = place.stat()
+    except FileNotFoundError:
+        before = None
+        place.parent.stat()  # `atomic_write` would make it
+    special = before is not None and not stat.S_ISREG(before.st_mode)
+    if special or (before is not None and not os.access(place.parent, os.W_OK)):
+        try:
+            path.write_bytes(content)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        return
+    try:
+        atomic_write(place, content)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    if before is not None:
+        with suppress(OSError):  # another user's file
+            place.chmod(stat.S_IMODE(before.st_mode))

@@ -16,6 +16,7 @@ from vical_daemon.results.report.figures import INK, SOFT, Drawing, X, Z, style
 from vical_daemon.results.report.provenance import Provenance
 from vical_daemon.results.report.verdict import Verdict
 from vical_daemon.results.report.writer import Gallery, ReportError, provenance_section
+from vical_daemon.service.atomic_file import write_output
 
 _WITHIN_Z = 2.0  # joint sigmas; marked for the eye, no verdict depends on it
 _KIND = {"same": "converged", "changed": "inconsistent"}  # their colours
@@ -55,7 +56,7 @@ def write_comparison(
         body.append(page.section("Assumed", *(page.note(note) for note in document["notes"])))
     body.append(provenance_section(provenance))
     try:
-        path.write_text(page.document("Two calibrations compared", body), encoding="utf-8")
+        write_output(path, page.document("Two calibrations compared", body))
     except OSError as error:
         raise ReportError(f"{path}: cannot write the report: {error.strerror or error}") from error
 

@@ -12,6 +12,7 @@ from vical_daemon.results.report import page, values
 from vical_daemon.results.report.provenance import Provenance, collect
 from vical_daemon.results.report.residuals import FrameResiduals
 from vical_daemon.results.report.verdict import verdict
+from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
     from vical_daemon.results.report.figures import Drawing
@@ -96,7 +97,7 @@ def write_report(
         if rows:
             body.append(page.section("What was announced, when", page.table(("time", "event"), rows, 9)))
         body.append(provenance_section(provenance or collect()))
-        path.write_text(page.document(_TITLE, body), encoding="utf-8")
+        write_output(path, page.document(_TITLE, body))
     except OSError as error:
         raise ReportError(f"{path}: cannot write the report: {error.strerror or error}") from error
 
