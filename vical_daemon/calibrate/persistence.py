@@ -66,6 +66,7 @@ class CalibrationPersistence:
         self.problem = ""  # why the last result could not be stored
         self._status: Status | None = None
         self._announced: list[Event] = []
+        self._twins: set[str] = set()  # serial numbers that several cameras have, and that was said
         pattern = topics.STATUS.pattern
         self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
@@ -139,6 +140,7 @@ class CalibrationPersistence:
 
     def said(self, estimate: CalibrationEstimate, events: list[Event]) -> CalibrationEstimate:
         """Write events to the journal; return the estimate with them and those announced."""
+        self._announce_twins()
         for event in events:
             self._journal(event)
         events = [*self._announced, *events]
@@ -158,6 +160,7 @@ class CalibrationPersistence:
                 notify.event("converged", f"{self._config.rig}: calibration converged", rig=self._config.rig)
             if time.monotonic() - self._saved_s > SAVE_EVERY_S:
                 self.save(estimate)
+        self._announce_twins()
         for event in events:
             self._journal(event)
         self._status = estimate.status
@@ -299,8 +302,30 @@ class CalibrationPersistence:
             self._complete.set()
 
     def _pair(self, camera: str) -> tuple[str, str]:
+        """Return what the calibration of a camera is stored under; "" for what is not known yet."""
         known = self._serials.known
-        return known.get(f"imu/{self._config.calibration_imu}", ""), known.get(f"camera/{camera}", "")
+        serial = known.get(f"camera/{camera}", "")
+        if serial and len(self._bearers(serial)) > 1:
+            serial = f"{serial} {camera}"
+        return known.get(f"imu/{self._config.calibration_imu}", ""), serial
+
+    def _bearers(self, serial: str) -> list[str]:
+        """Return the cameras of the rig with a serial number: cheap models have one for all."""
+        known = self._serials.known
+        names = self._config.calibration_cameras
+        return [name for name in names if known.get(f"camera/{name}") == serial]
+
+    def _announce_twins(self) -> None:
+        """Say once which cameras only their names tell apart."""
+        for serial in {*self._serials.known.copy().values()} - self._twins:
+            names = self._bearers(serial)
+            if len(names) > 1:
+                self._twins.add(serial)
+                said = (
+                    f"{' and '.join(names)} have the same serial number {serial}: only their places in the "
+                    "config tell them apart, name them by port (`vical devices`)"
+                )
+                self.announce(Event(EventKind.OTHER, said=said))
 
     def _load(self, camera: str) -> StoredCalibration | None:
         imu_serial, camera_serial = self._pair(camera)

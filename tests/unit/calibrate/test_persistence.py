@@ -305,6 +305,31 @@ def test_what_cannot_be_used_is_not_accepted(config: Config, estimate: Calibrati
     assert persistence.stored_messages() == []
 
 
+def test_cameras_with_one_serial_number_keep_their_own_calibrations(tmp_path: Path) -> None:
+    """Cheap cameras of one model have the same; the one stored last was the prior of both."""
+    config = loads(
+        "imus: {imu0: {port: /dev/x, rate_hz: 100}}\n"
+        "cameras: {left: {uri: 'v4l2:/dev/video0'}, right: {uri: 'v4l2:/dev/video2'}}\n"
+        f"target: t.yaml\nstore: {{directory: {tmp_path / 'store'}}}\n"
+    )
+
+    def begin() -> CalibrationPersistence:
+        bus = LocalBus()
+        persistence = CalibrationPersistence(config, bus, private_clock())
+        statuses = [DiagnosticStatus(Level.OK, f"camera/{name}", "", "SN0001") for name in config.cameras]
+        statuses.append(DiagnosticStatus(Level.OK, "imu/imu0", "", "I1"))
+        bus.publish(topics.STATUS.key("rig0", "camera"), encode_diagnostics(1, "camera", statuses))
+        return persistence
+
+    persistence = begin()
+    cameras = {"left": _camera(), "right": _camera(p_m=(-0.08, 0.02, -0.03))}
+    said = _said(persistence, replace(_estimate(_camera()), cameras=cameras))
+    assert len(said) == 1 and said[0].startswith("left and right have the same serial number SN0001")
+    assert _said(persistence, replace(_estimate(_camera()), cameras=cameras)) == []
+    priors = begin().priors()
+    assert [priors[name].T_imu_cam[1][0] for name in cameras] == [0.08, -0.08]
+
+
 def test_discard_puts_back_what_was_stored_before(config: Config) -> None:
     _remember(config, _camera())
     persistence = _later(config)
