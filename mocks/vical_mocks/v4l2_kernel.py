@@ -85,8 +85,9 @@ class FakeKernel(Requests):
             (self.sysfs / "class/video4linux" / name).symlink_to(folder)
             (self.dev / name).touch()
             self._plugged[str(self.dev / name)] = plugged
-            link = f"usb-{camera.serial_number}-video-index{index}"
-            (self.dev / "v4l/by-id" / link).symlink_to(self.dev / name)
+            link = self.dev / "v4l/by-id" / f"usb-{camera.serial_number}-video-index{index}"
+            link.unlink(missing_ok=True)  # of two cameras with one serial number the last one has the link
+            link.symlink_to(self.dev / name)
         (usb / "idVendor").write_text("1d6b\n")
         (usb / "serial").write_text(camera.serial_number + "\n")
         (usb / "descriptors").write_bytes(camera.usb_descriptors())

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from vical_drivers.samples import Frame, FrameSource
 
 from vical_daemon.acquire.device_loop import FrameReader
-from vical_daemon.acquire.pipeline import DevicePipeline, run_pipelines, start_pipeline
+from vical_daemon.acquire.pipeline import DevicePipeline, StampOrder, run_pipelines, start_pipeline
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import encode_image
@@ -36,8 +36,7 @@ class CameraEncoder:
     def __init__(self, rig: str, name: str, clock: WallClock) -> None:
         self.key = topics.IMAGE.key(rig, name)
         self._name, self._clock = name, clock
-        self._t_last_ns = 0
-        self._backwards = 0
+        self._order = StampOrder()
         self._dropped = 0
         self._rules: Counter[str] = Counter()
         self._exposure_ns: int | None = None
@@ -45,10 +44,8 @@ class CameraEncoder:
     def message(self, frame: Frame) -> bytes | None:
         """Return the message of one frame, stamped mid-exposure; None if its stamp does not increase."""
         self._dropped += frame.dropped_before
-        if frame.t_exposure_mid_ns <= self._t_last_ns:
-            self._backwards += 1
+        if not self._order.admits(frame.t_exposure_mid_ns):
             return None
-        self._t_last_ns = frame.t_exposure_mid_ns
         self._rules[frame.stamp_rule] += 1
         self._exposure_ns = frame.exposure_ns
         stamp_ns = self._clock.unix_ns(frame.t_exposure_mid_ns)
@@ -60,7 +57,7 @@ class CameraEncoder:
         counters = {
             "stamp_rule": rules,
             "frames_dropped": str(self._dropped),
-            "stamps_backwards": str(self._backwards),
+            "stamps_backwards": str(self._order.backwards),
         }
         if self._exposure_ns is not None:
             counters["exposure_ms"] = f"{1e-6 * self._exposure_ns:.3f}"

@@ -131,6 +131,8 @@ class DeviceLoop(Generic[T]):
         self._health = DeviceHealth()
         self._source: Source[T] | None = None
         self._broken = False  # the source raised an unexpected error: close it
+        self._fails_at_once = False  # opened, it failed before any data came
+        self._logged = ""  # the last problem, until there are data again
         self._turn = (
             threading.Lock()
         )  # held while reading: samples are delivered in the order in which they were read
@@ -167,7 +169,8 @@ class DeviceLoop(Generic[T]):
             try:
                 with self._open_source() as source:
                     self._opened(source)
-                    if self._stream():
+                    self._fails_at_once = not self._stream()
+                    if not self._fails_at_once:
                         pause_s = self._first_pause_s
             except Exception as error:  # libraries raise anything when a device is gone
                 self._failed(error)
@@ -229,8 +232,9 @@ class DeviceLoop(Generic[T]):
 
     def _opened(self, source: Source[T]) -> None:
         info = source.info
-        _log.info("%s: open: %s %s serial %s", self.name, info.kind, info.model, info.serial_number)
         known = self._health.info
+        if not (self._fails_at_once and known == info):
+            _log.info("%s: open: %s %s serial %s", self.name, info.kind, info.model, info.serial_number)
         if known is not None and known.serial_number and info.serial_number not in ("", known.serial_number):
             text = (
                 f"{self.name} is another device now: {info.model} serial {info.serial_number}, "
@@ -244,10 +248,12 @@ class DeviceLoop(Generic[T]):
         self._source = source
 
     def _streams(self, source: Source[T]) -> None:
-        if self._health.state == "lost":
+        if self._health.state == "lost" or self._fails_at_once:
+            self._fails_at_once = False
             _log.info("%s: back", self.name)
             notify.event("device_back", f"{self.name} is back", device=self.name)
         self._health = replace(self._health, state="streaming", problem="", info=source.info)
+        self._logged = ""
 
     def _ended(self, text: str) -> None:
         _log.info("%s: %s", self.name, text)
@@ -258,8 +264,9 @@ class DeviceLoop(Generic[T]):
         text = str(error) if isinstance(error, DriverError) else f"{type(error).__name__}: {error}"
         problem = " ".join(text.split())
         _log.debug("%s failed", self.name, exc_info=error)
-        if problem != self._health.problem:  # logged once, not at each attempt
+        if problem != self._logged:  # once, not at each attempt
             _log.warning("%s: %s", self.name, problem)
-        if self._health.state in ("streaming", "silent"):
-            notify.event("device_lost", f"{self.name}: {problem}", level="warning", device=self.name)
+            if self._health.state in ("streaming", "silent"):
+                notify.event("device_lost", f"{self.name}: {problem}", level="warning", device=self.name)
+        self._logged = problem
         self._health = replace(self._health, state="lost", problem=problem)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from vical_drivers.samples import ImuSample, ImuSource
 
-from vical_daemon.acquire.pipeline import DevicePipeline, run_pipelines, start_pipeline
+from vical_daemon.acquire.pipeline import DevicePipeline, StampOrder, run_pipelines, start_pipeline
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import imu_encoder
@@ -34,8 +34,7 @@ class ImuEncoder:
     def __init__(self, rig: str, name: str, clock: WallClock) -> None:
         self.key = topics.IMU.key(rig, name)
         self._encode, self._offset_ns = imu_encoder(name), clock.unix_ns(0)
-        self._t_last_ns = 0
-        self._backwards = 0
+        self._order = StampOrder()
         self._worst_sigma_ns = 0
 
     def message(self, sample: ImuSample) -> bytes | None:
@@ -44,12 +43,8 @@ class ImuEncoder:
         The stamp is the instant of the measurement: the driver has subtracted wire time and filter delay.
         """
         t_host_ns = sample.t_host_ns
-        if (
-            t_host_ns <= self._t_last_ns
-        ):  # the device clock restarted: drop samples until stamps increase again
-            self._backwards += 1
+        if not self._order.admits(t_host_ns):  # the device clock restarted
             return None
-        self._t_last_ns = t_host_ns
         if sample.t_sigma_ns > self._worst_sigma_ns:
             self._worst_sigma_ns = sample.t_sigma_ns
         return self._encode(t_host_ns + self._offset_ns, sample.gyro_rps, sample.specific_force_mps2)
@@ -57,7 +52,7 @@ class ImuEncoder:
     def counters(self) -> dict[str, str]:
         """Return counters that the driver does not keep; the stamp sigma is the worst since the last call."""
         sigma_us, self._worst_sigma_ns = self._worst_sigma_ns * 1e-3, 0
-        return {"stamps_backwards": str(self._backwards), "stamp_sigma_us": f"{sigma_us:.1f}"}
+        return {"stamps_backwards": str(self._order.backwards), "stamp_sigma_us": f"{sigma_us:.1f}"}
 
 
 def open_imu(config: ImuConfig) -> ImuSource:

@@ -18,6 +18,9 @@ from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock
 
 JOIN_S = 3.0
+SET_BACK_NS = 1_000_000_000
+"""A stamp that lies further behind the last one is no disorder of a driver: a clock was set back, or the last
+stamp was wrong. Without this limit one stamp of tomorrow would hold a device back until tomorrow."""
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
@@ -37,6 +40,29 @@ class MessageEncoder(Protocol[T_contra]):
     def counters(self) -> dict[str, str]:
         """Return counters that the driver does not keep."""
         ...
+
+
+class StampOrder:
+    """Holds back the items of a device whose stamps do not increase.
+
+    Attributes:
+        backwards: How many stamps did not increase.
+    """
+
+    __slots__ = ("_last_ns", "backwards")
+
+    def __init__(self) -> None:
+        self._last_ns = -SET_BACK_NS
+        self.backwards = 0
+
+    def admits(self, stamp_ns: int) -> bool:
+        """Whether an item with this stamp may pass; a clock that was set back passes."""
+        if stamp_ns <= self._last_ns:
+            self.backwards += 1
+            if self._last_ns - stamp_ns < SET_BACK_NS:
+                return False
+        self._last_ns = stamp_ns
+        return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,6 +81,13 @@ class TestAcquisition:
         assert role.counters()["frames_dropped"] == "2"
         assert role.message(_frame(6)) is None
 
+    def test_a_clock_that_was_set_back_holds_a_device_up_for_a_second_at_most(self) -> None:
+        """One stamp of in an hour held all images back for an hour, and the status said that all is well."""
+        role, hour_ms = CameraEncoder("rover", "cam0", CLOCK), 3_600_000
+        passed = [role.message(_frame(k)) is not None for k in (1000, 1000 + hour_ms, 1050, 1100, 900, 1150)]
+        assert passed == [True, True, True, True, False, True]
+        assert role.counters()["stamps_backwards"] == "2"
+
     def test_run_publishes_every_sample_and_a_status(self, config: Config) -> None:
         bus, stop = LocalBus(), threading.Event()
         got: list[Sample] = []

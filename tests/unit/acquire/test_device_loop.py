@@ -107,6 +107,24 @@ def test_a_lost_device_is_reported_and_comes_back_by_itself(stop) -> None:
     assert loop.health().openings == 1
 
 
+def test_a_driver_that_dies_again_and_again_is_logged_once(stop, caplog) -> None:
+    caplog.set_level("INFO")
+    opened: list[int] = []
+
+    def opener() -> ScriptedSource:
+        opened.append(1)
+        return ScriptedSource([RuntimeError("a bug")] if len(opened) < 6 else [[1]])
+
+    got: list[int] = []
+    loop = _loop(opener, got, stop)
+    _wait_for(lambda: bool(got) and loop.health().state == "streaming")
+    assert loop.health().openings == 6
+    lines = [record.message for record in caplog.records]
+    assert lines == [
+        f"imu/imu0: {line}" for line in ("open: imu scripted serial S1", "RuntimeError: a bug", "back")
+    ]
+
+
 def test_another_device_is_opened_from_scratch_and_told_in_the_journal(stop, monkeypatch) -> None:
     events: list[tuple[str, str]] = []
     monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append((name, text)))

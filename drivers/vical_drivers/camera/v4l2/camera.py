@@ -27,7 +27,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.camera.v4l2 import abi
 from vical_drivers.camera.v4l2.controls import Controls
-from vical_drivers.camera.v4l2.discovery import find_again, find_node
+from vical_drivers.camera.v4l2.discovery import find_again, find_node, twin_ports
 from vical_drivers.camera.v4l2.exposure import read_exposure_ns, set_exposure
 from vical_drivers.camera.v4l2.kernel import Kernel, LinuxKernel
 from vical_drivers.camera.v4l2.kernel_stamp import kernel_stamp, to_monotonic_ns
@@ -80,6 +80,7 @@ class V4l2Camera(Closing):
 
     def _open(self) -> None:
         self._session = V4l2Session(self._kernel, self._entry, self._settings)
+        self._twins = twin_ports(self._kernel, self._entry)
         self._frames.stamper.set_exposure(self._session.exposure_ns, 0)
         self._sequence.restart()
         self._borrowed = None
@@ -90,10 +91,10 @@ class V4l2Camera(Closing):
             session.close()
 
     def _come_back(self, timeout_s: float) -> None:
-        entry = find_again(self._kernel, self._entry)
+        entry = find_again(self._kernel, self._entry, self._twins)
         if entry is None:
             self._wait(timeout_s)
-            entry = find_again(self._kernel, self._entry)
+            entry = find_again(self._kernel, self._entry, self._twins)
         if entry is None:
             raise DeviceLostError(f"{self._entry.path}: the camera is still away; plug it in again")
         self._entry = entry

@@ -118,11 +118,24 @@ def find_node(kernel: Kernel, name: str) -> NodeEntry:
     return NodeEntry(path=name, name="", index=0, serial_number="", port=real.name)
 
 
-def find_again(kernel: Kernel, lost: NodeEntry) -> NodeEntry | None:
-    """Return where a camera is now, which may be another number; None while it is away."""
+def twin_ports(kernel: Kernel, camera: NodeEntry) -> frozenset[str]:
+    """Return the ports of other cameras that have the same name and serial number."""
+    alike = (entry.port for entry in list_nodes(kernel) if entry.is_same_device(camera))
+    return frozenset(port for port in alike if port != camera.port)
+
+
+def find_again(kernel: Kernel, lost: NodeEntry, twins: frozenset[str] = frozenset()) -> NodeEntry | None:
+    """Return where a camera is now, which may be another number or port; None while it is away.
+
+    Args:
+        kernel: The system.
+        lost: The camera as it was.
+        twins: Ports of cameras that cannot be told from it, see `twin_ports`.
+    """
     if not lost.name:
         return lost
-    return next((e for e in list_nodes(kernel) if e.is_same_device(lost)), None)
+    alike = [e for e in list_nodes(kernel) if e.is_same_device(lost) and e.port not in twins]
+    return min(alike, key=lambda entry: entry.port != lost.port, default=None)
 
 
 def metadata_node(kernel: Kernel, camera: NodeEntry) -> NodeEntry | None:

@@ -67,6 +67,22 @@ def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fak
         source.read(0.1)
 
 
+@pytest.mark.parametrize("port", ["1-3", "1-4"])
+def test_of_two_cameras_with_one_serial_number_the_lost_one_comes_back(open_fake, kernel, port: str) -> None:
+    """Its twin, found first, is in use: it was tried again and again, and the lost one never came back."""
+    kernel.plug(FakeCamera(port="1-1"), number=0)
+    camera = FakeCamera(port="1-3", faults={1: "unplug"})
+    source = open_fake(camera, number=2)
+    source.read(1.0)
+    with pytest.raises(errors.DeviceLostError, match="went away"):
+        source.read(1.0)
+    with pytest.raises(errors.DeviceLostError, match="video2: the camera is still away"):
+        source.read(0.1)
+    camera.faults, camera.port = {}, port
+    kernel.plug(camera, number=6)
+    assert source.read(1.0) is not None and source._entry.path.endswith("video6")
+
+
 def test_without_serial_numbers_another_camera_in_the_port_has_another_identity() -> None:
     def identity(name: str, port: str, serial_number: str = "") -> str:
         return NodeEntry("/dev/video0", name, 0, serial_number, port).identity
