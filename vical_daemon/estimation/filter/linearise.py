@@ -159,7 +159,8 @@ def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: 
 def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order, about the nominal state; global shutter only."""
     uv, ways, by_error = view_derivatives(state, layout, rates, image)
-    valid = np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1])
+    with np.errstate(invalid="ignore"):  # nan is behind the camera
+        valid: BoolArray = np.asarray((np.abs(uv) < _FAR_PX).all(axis=1))
     if not valid.all():
         uv, ways = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], ways, 0.0)
     k = len(by_error)

@@ -102,6 +102,23 @@ def test_points_behind_the_camera_are_invalid_either_way():
     assert np.isfinite(straight.ways @ straight.spread).all()
 
 
+def test_points_beside_the_camera_are_invalid_either_way():
+    """Their pixels are as far out as they are uncertain: one passed its gate, and the time shift became a day."""
+    state, layout, rates, image = scene("radtan")
+    start, along = image.points[0].copy(), np.linspace(0.0, 1.5, len(image.points))[:, None]
+    image.points[:] = start + along * (state.p_world_imu - start)
+    image.points[:, 0] += 0.3 * along[:, 0]
+    S = np.diag(np.full(layout.size, 1e-5))
+    uv = view_derivatives(state, layout, rates, image)[0]
+    beside = np.isfinite(uv).all(axis=1) & (np.abs(uv) > 1e5).any(axis=1)
+    assert beside.any()
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
+    straight = by_derivatives(state, layout, rates, image, S)
+    np.testing.assert_array_equal(straight.valid, points.valid)
+    assert straight.valid.any() and not straight.valid[beside].any()
+    assert np.abs(straight.z).max() < 1e5
+
+
 @pytest.mark.parametrize("estimate", [frozenset(), frozenset({"imu_intrinsics"})])
 def test_derivatives_of_the_motion_agree_with_sigma_points(estimate):
     state, layout, _, _ = scene("radtan", estimate=estimate)
