@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +16,12 @@ from vical_daemon.logs.mcap.files import PART_SUFFIX, LockedFile, LogError, desc
 
 CHUNK_BYTES = 1_048_576
 _ROS_TOPIC = re.compile(r"/[A-Za-z0-9_/]+")
+_SDK_LOG = logging.getLogger("foxglove.log_sink_set")
+
+
+def _not_of_the_file(record: logging.LogRecord) -> bool:
+    """Whether a line of the SDK is news: that a write failed, with a traceback, is what `LogError` says."""
+    return "McapError(Io" not in record.getMessage()
 
 
 class LogWriter(Closing):
@@ -40,6 +47,7 @@ class LogWriter(Closing):
         if path.exists():
             raise LogError(f"{path} exists already; remove it or choose another name")
         self.path = path
+        _SDK_LOG.addFilter(_not_of_the_file)  # once, however often
         self._file = LockedFile(path.with_name(path.name + PART_SUFFIX))
         self._context = foxglove.Context()
         options = MCAPWriteOptions(

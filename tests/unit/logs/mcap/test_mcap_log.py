@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import fcntl
 import os
 import struct
@@ -207,7 +208,7 @@ def test_key_without_a_type_is_refused(tmp_path):
                 writer.write(key, b"", T0)
 
 
-def test_full_disk_is_an_error_and_costs_only_the_end(tmp_path, monkeypatch):
+def test_full_disk_is_an_error_and_costs_only_the_end(tmp_path, monkeypatch, caplog):
     writer = LogWriter(tmp_path / "a.mcap")
     fill(writer, 200)
     writer.flush()
@@ -222,6 +223,12 @@ def test_full_disk_is_an_error_and_costs_only_the_end(tmp_path, monkeypatch):
     with pytest.raises(LogError, match="No space left"):
         writer.close()
     monkeypatch.setattr(os, "write", real)
+    sdk = logging.getLogger("foxglove.log_sink_set")
+    sdk.warning(
+        'error logging message: McapError(Io(Custom { ... traceback: Some("Traceback (most ...") } }))'
+    )
+    sdk.warning("something else")
+    assert "Traceback" not in caplog.text and "something else" in caplog.text
     assert recover_folder(tmp_path)
     assert read(tmp_path / "a.mcap")[1][:200] == list(range(200))
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
