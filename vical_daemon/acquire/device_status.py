@@ -64,7 +64,8 @@ def _level(
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
     if queue.dropped:
-        return Level.WARN, f"{queue.dropped} samples dropped: the bus is too slow"
+        rate = f"{health.stats.rate_hz:.1f} Hz; " if health.stats.rate_hz else ""
+        return Level.WARN, f"{rate}{queue.dropped} samples dropped since the start: the bus is too slow"
     if health.stats.rate_hz and abs(health.stats.rate_hz / nominal_rate_hz - 1) > 0.1:
         return Level.WARN, f"{health.stats.rate_hz:.1f} Hz instead of {nominal_rate_hz:g} Hz"
     return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost"

@@ -30,6 +30,7 @@ _ANSWERED = {"accept": ("accepted", "not accepted"), "discard": ("discarded", "n
 _OF_VERIFY = ("check", "calibrate", "verify")  # have an effect only with `mode: verify`
 _BUS_S = 3.0
 _ANSWER_S = 5.0  # estimates come five times a second
+_STATUS_S = 2.0  # within this time a role has said how it is
 _BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.role`
 _EPILOG = """\
   vical command accept            store the present result as the calibration of these devices
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if bus is None:
         return 0
     try:
-        rig = args.rig or _rig(bus)
+        rig = _rig(bus, args.rig or _rig_of(args.config))
         answer = send(bus, rig, args.word)
     finally:
         bus.close()
@@ -109,7 +110,7 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
     try:
         bus.publish(topics.COMMAND.key(rig, role), encode_string(said))
         if word not in _ANSWERED:
-            return f"sent: {word} to {rig}"
+            return _sent(bus, rig, word)
         if not came.wait(answer_s):
             if not bus.latest(topics.STATUS.key(rig, role)):
                 raise CliError(f"no answer from {rig}: is the role estimate (vical-calibrate) running?")
@@ -119,6 +120,27 @@ def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
     finally:
         subscription.close()
     return answers[0]
+
+
+def _sent(bus: Bus, rig: str, word: str) -> str:
+    """Return that a command which has no answer was sent, after a look at who it is for.
+
+    Raises:
+        CliError: The role does not run, or it says that it cannot.
+    """
+    from vical_daemon.bus import topics
+    from vical_daemon.bus.messages import Level, decode_diagnostics
+
+    role, _ = WORDS[word]
+    if word == "record-start":
+        time.sleep(_STATUS_S)
+    statuses = bus.latest(topics.STATUS.key(rig, role))
+    if not statuses:
+        raise CliError(f"no answer from {rig}: is the role {role} running?")
+    for status in decode_diagnostics(statuses[-1].payload).statuses:
+        if word == "record-start" and status.level == Level.ERROR:
+            raise CliError(f"not recording: {status.message}")
+    return f"sent: {word} to {rig}"
 
 
 def _check_effect(bus: Bus, rig: str, word: str) -> None:
@@ -157,11 +179,20 @@ def _answer(sample: Sample, word: str) -> str:
     return next((text for text in texts if text.startswith(_ANSWERED[word])), "")
 
 
-def _rig(bus: Bus) -> str:
-    """Return the only rig on the bus.
+def _rig_of(config_path: str | None) -> str:
+    """Return the rig of a config, "" without one."""
+    from vical_daemon.config.model import load
+
+    return load(config_path).rig if config_path else ""
+
+
+def _rig(bus: Bus, wanted: str) -> str:
+    """Return the rig to command: the wanted one, or else the only one on the bus.
+
+    A bus may be that of another rig: the service's where one's own does not run, or a site's router.
 
     Raises:
-        CliError: There is none, or several.
+        CliError: There is none, not the wanted one, or several.
     """
     from vical_daemon.bus import topics
 
@@ -169,6 +200,10 @@ def _rig(bus: Bus) -> str:
     rigs = sorted({entry.rig for entry in parsed if entry is not None})
     if not rigs:
         raise CliError("nothing on the bus yet; is `vical run` (vical.target) up?")
+    if wanted and wanted not in rigs:
+        raise CliError(f"the rig {wanted} is not on this bus, only {', '.join(rigs)}")
+    if wanted:
+        return wanted
     if len(rigs) > 1:
         raise CliError(f"there are the rigs {', '.join(rigs)}: say which with --rig", EXIT_USAGE)
     return rigs[0]

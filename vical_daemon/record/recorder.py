@@ -278,11 +278,10 @@ class Recorder:
             pass  # the folder is missing: `problem` reports it
         if self._problem:
             return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
-        if queue.dropped or lost:
-            return DiagnosticStatus(
-                Level.WARN, "record", f"{values['dropped']} dropped, {lost} lost", values=values
-            )
         message = f"recording, {self.messages} messages" if session else "stopped by command"
+        if queue.dropped or lost:
+            message = f"{message}; {values['dropped']} dropped, {lost} lost since the start"
+            return DiagnosticStatus(Level.WARN, "record", message, values=values)
         return DiagnosticStatus(Level.OK, "record", message, values=values)
 
 

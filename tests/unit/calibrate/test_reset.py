@@ -128,7 +128,32 @@ def test_a_command_is_answered_on_the_bus_and_in_the_terminal(running, word, ans
 def test_a_command_without_anybody_who_listens_says_so():
     with pytest.raises(CliError, match="no answer from rig0"):
         command.send(LocalBus(), "rig0", "accept", 0.05)
-    assert command.send(LocalBus(), "rig0", "record-start") == "sent: record-start to rig0"
+    with pytest.raises(CliError, match="no answer from rig0: is the role record running"):
+        command.send(LocalBus(), "rig0", "record-stop")
+
+
+@pytest.mark.parametrize(("level", "problem"), [(Level.OK, ""), (Level.ERROR, "the disk is full")])
+def test_a_recording_that_does_not_begin_is_no_success(monkeypatch, level, problem):
+    monkeypatch.setattr(command, "_STATUS_S", 0.0)
+    bus = LocalBus()
+    status = [DiagnosticStatus(level, "record", problem)]
+    bus.publish(topics.STATUS.key("rig0", "record"), encode_diagnostics(1, "record", status))
+    assert command.send(bus, "rig0", "record-stop") == "sent: record-stop to rig0"
+    if problem:
+        with pytest.raises(CliError, match="not recording: the disk is full"):
+            command.send(bus, "rig0", "record-start")
+    else:
+        assert command.send(bus, "rig0", "record-start") == "sent: record-start to rig0"
+
+
+def test_a_command_is_for_the_rig_of_the_config():
+    """The bus may be another rig's: of the service, or of a site."""
+    bus = LocalBus()
+    status = encode_diagnostics(1, "record", [DiagnosticStatus(Level.OK, "record", "")])
+    bus.publish(topics.STATUS.key("robot1", "record"), status)
+    assert command._rig(bus, "") == command._rig(bus, "robot1") == "robot1"
+    with pytest.raises(CliError, match="the rig robot2 is not on this bus, only robot1"):
+        command._rig(bus, "robot2")
 
 
 @pytest.mark.parametrize("word", ["check", "calibrate", "verify"])

@@ -103,7 +103,7 @@ def test_points_behind_the_camera_are_invalid_either_way():
 
 
 def test_points_beside_the_camera_are_invalid_either_way():
-    """Their pixels are as far out as they are uncertain: one passed its gate, and the time shift became a day."""
+    """Their pixels are as uncertain as they are far out: one passed its gate, the time shift was a day."""
     state, layout, rates, image = scene("radtan")
     start, along = image.points[0].copy(), np.linspace(0.0, 1.5, len(image.points))[:, None]
     image.points[:] = start + along * (state.p_world_imu - start)

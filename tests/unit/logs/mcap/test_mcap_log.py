@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
-import logging
 import fcntl
+import logging
 import os
 import struct
 import threading
