@@ -38,9 +38,10 @@ from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch, suspect
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
-from vical_daemon.estimation.status.recent_past import BEFORE_S, RecentPast
+from vical_daemon.estimation.status.pending_change import PendingChange
+from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
-from vical_daemon.estimation.status.what_jumped import MOVED, Part, lens_stepped, what_jumped
+from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
@@ -79,9 +80,7 @@ class Calibrator:
         self._held_back = HoldoutCheck()
         self._acceptance = ModelAcceptance()
         self._past = RecentPast()
-        # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
-        self._unproven: tuple[float, str, float] | None = None
-        self._sure_from_s = -np.inf  # until then it is not asked again what jumped
+        self._change: PendingChange | None = None  # the last, until images confirm it
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
 
@@ -242,6 +241,8 @@ class Calibrator:
             item = self._pending.pop(shifts, covered_s, flush=flush)
             if item is None:
                 break
+            if self._change is not None:
+                self._change.images.append(item)
             if self._late.take(self.filter, *item):
                 if self.filter.unobservable is not None:  # a full start is still to come
                     self._initializer.take([item])
@@ -315,17 +316,18 @@ class Calibrator:
                 self.filter = None
                 return [report]
         self._trim(f.state.t_s)
-        self._ask_held_back(f, report, frame, t_cam_s)
+        ratio = self._held_back.follow(f, report, frame, t_cam_s, self.rig.target, self._buffer)
+        if ratio is not None:
+            self.evaluator.held_back(ratio, f, frame.camera)
         if not f.finite():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
             return [report]
         self._note(f, report, frame, t_cam_s)
-        if self._unproven is not None and f.state.t_s > self._unproven[0]:
-            (_, camera, before_s), self._unproven = self._unproven, None
-            step_s = f.state.cameras[camera].timeshift_s - before_s
-            self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
-        if f.unobservable is None and not self.watch.undecided:  # see `StatusEvaluator.saw_frame`
+        if self._change is not None and self._change.confirmed(f.state.t_s):
+            news, self._change = self._change.news(f), None
+            self.evaluator.announce_all([] if news is None else [news])
+        if f.unobservable is None and self._change is None and not self.watch.undecided:
             for block, event in self._acceptance.look(f).items():
                 self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
@@ -337,20 +339,11 @@ class Calibrator:
         self._past.saw(f, report, frame, t_cam_s)
         self.evaluator.saw_frame(report, f)
 
-    def _ask_held_back(
-        self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float
-    ) -> None:
-        """Judge how well an image was predicted that the held-back copy of the filter has not used."""
-        assert self._buffer is not None
-        ratio = self._held_back.follow(f, report, frame, t_cam_s, self.rig.target, self._buffer)
-        if ratio is not None:
-            self.evaluator.held_back(ratio, f, frame.camera)
-
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action in (Action.ASK, Action.POSE, Action.RESTART) and self._part_changed(f, suspect(f, frame)):
+        if action.asks and (self._nothing_changed() or self._part_changed(f, suspect(f, frame))):
             return
         if action is Action.POSE:
             self._lose_motion(jumped=True)
@@ -363,44 +356,51 @@ class Calibrator:
         elif action is Action.RESTART:
             self._restart(f)
 
+    def _nothing_changed(self) -> bool:
+        """See whether images fit what was known before a change; if they do, they were wrong for a while."""
+        refused, change = self.watch.why is Cause.IMAGES_REFUSED, self._change
+        f = change.undone(self._step) if change is not None and refused else None
+        if f is None:
+            return False
+        self.filter, self._change, self._lost = f, None, None
+        self._past.changed(f)
+        self.watch.shift_reopened()
+        self.evaluator.nothing_changed(f.state.t_s)
+        return True
+
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
         """See whether images no longer fit because something jumped; go on with all of that unknown."""
         assert self._buffer is not None
-        if f.unobservable is not None or f.state.t_s < self._sure_from_s:
+        if f.unobservable is not None:
             return False
         before, fit = self._past.filter(f), None  # images since have moved the present one
-        if self._unproven is None and self.rig.layout.cameras[camera].timeshift is not None:
+        stepped = self._change is not None and self._change.shift_stepped
+        if not stepped and self.rig.layout.cameras[camera].timeshift is not None:
             fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
-            return self._part_jumped(before, camera)
+            return self._part_jumped(before, camera, stepped=stepped)
+        change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, before, self._past.since(before))
+        self._change = change.after(self._change)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
-        self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self._set_shift(before, camera, fit)
+        self._past.changed(before)
         self._lose_motion()
         return True
 
-    def _part_jumped(self, before: CalibrationFilter, camera: str) -> bool:
+    def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        found = what_jumped(before, self._past.since(before), camera, self._step)
-        part, f = found.part, found.filter
-        if part is Part.NONE or (self._unproven is not None and part in (Part.SHIFT, Part.DRIFT)):
+        images = self._past.since(before)
+        part, possible, f, known, at = what_jumped(before, images, camera, self._step)
+        if part is Part.NONE or (stepped and part in (Part.SHIFT, Part.DRIFT)):
             return False
-        self.filter, self._unproven = f, None
-        self._sure_from_s = f.state.t_s + BEFORE_S
-        self.evaluator.jumped(f.state.t_s)
-        if found.possible & MOVED:
-            self.evaluator.may_have_moved(before, self.watch.why, sure=found.possible <= MOVED)
-        elif part is Part.TARGET:
+        change = PendingChange(part, possible, camera, f.state.t_s, known, images[at:]).after(self._change)
+        change.tell(f, before, self.evaluator, self.watch.why)
+        self.filter, self._change = f, change
+        self._past.changed(f)
+        if part is Part.TARGET and not change.moved:
             self._lose_motion(jumped=True)
-            self.evaluator.announce(Event(EventKind.POSE_LOST))
-        elif part is Part.DRIFT:
-            self.evaluator.announce(clock_drift.let_drift(f, camera, anew=True), once=f"wander {camera}")
-        elif part is Part.LENS:
-            self.evaluator.announce(lens_stepped(before, f, camera))
-        else:
-            self._unproven = (f.state.t_s + BEFORE_S, camera, before.state.cameras[camera].timeshift_s)
         self.watch.shift_reopened()
         return True
 
@@ -423,7 +423,7 @@ class Calibrator:
         sound = before if before.finite() else None
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
-        self._unproven = None
+        self._change = None
         self._late.anew()
         self.evaluator.changed(self.watch.why)
         self._stale, self.filter = sound, None
@@ -470,7 +470,7 @@ class Calibrator:
                 f.reopen(where.timeshift, abs(self._intake.imu_stepped_s))
         self._intake.next_recording()
         self._pending = FrameQueue(list(self.rig.priors))
-        self._past, self._unproven, self._sure_from_s = RecentPast(), None, -np.inf
+        self._past, self._change = RecentPast(), None
         self._used_ns.clear()
         self._seek_shift.clear()
         self._initializer.anew()

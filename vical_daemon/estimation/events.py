@@ -232,11 +232,11 @@ REFERENCE: dict[EventKind, About] = {
         "When images have agreed with the new time shift for 3 s; target-free for 2 s.",
     ),
     EventKind.LENS_STEPPED: About(
-        "The lens changed at once: focus or zoom was turned, or focuses by itself. It is estimated again; "
-        "everything else is kept. Value: focal length fx, new minus old.",
+        "The lens changed at once: focus or zoom was turned, or focuses by itself. A lens that is not "
+        "fixed is estimated again; everything else is kept. Value: focal length fx, new minus old.",
         "px",
-        "With a board and a lens that is not fixed: when images no longer fit and only another lens explains "
-        "them, or when fx differs by 4 joint sigma and 1 px afterwards.",
+        "With a board: when images no longer fit, only another lens explains them, and images agree with it "
+        "for 3 s; or, of a lens that is not fixed, when fx differs by 4 joint sigma and 1 px afterwards.",
     ),
     EventKind.POSE_LOST: About(
         "The target was moved, or the pose was lost. It is found again; the calibration is kept.",

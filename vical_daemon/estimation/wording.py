@@ -351,7 +351,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         "",
         lambda e: (
             f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
-            "it is estimated again, all else is kept"
+            "a lens that is not fixed is estimated again, all else is kept"
         ),
     ),
     EventKind.POSE_LOST: (

@@ -8,13 +8,14 @@ navigation problems", 1966: parameters that are considered; docs/math/filter.md,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import CameraPrior, FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
+from vical_daemon.estimation.model.priors import OFF
 
 _OFF_SHARE = 0.02  # of the focal length, of fx fy cx cy; EuRoC's published lens is 1.5 % off in cx
 _OFF_DISTORTION = 0.05  # EuRoC's k1: 0.045
@@ -30,11 +31,13 @@ class FixedLens:
         values: As given, shape (n,).
         sigma: How well they are known, as given; zeros: exactly; shape (n,).
         off_sigma: By how much a lens is off that is not as given, one sigma, shape (n,).
+        off: Probability that it is not as given, before any image.
     """
 
     values: FloatArray
     sigma: FloatArray
     off_sigma: FloatArray
+    off: float = OFF
 
     @classmethod
     def of(cls, prior: CameraPrior) -> FixedLens | None:
@@ -60,6 +63,20 @@ class FixedLens:
         if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
             return None
         return cls.of(prior)
+
+    def may_have_jumped(self, covariance: FloatArray) -> FixedLens:
+        """The lens when images no longer fit: it is as likely to be another as to be the same.
+
+        Its values are correlated, and `off_sigma` is not. So that is as much smaller as makes the density at
+        the values as given, by which the alternatives are compared, that of the covariance.
+
+        Args:
+            covariance: Of how far it may be off now, shape (n, n): what images have said of values that have
+                not jumped still holds.
+        """
+        sigma = np.sqrt(np.diag(covariance))
+        sigma = sigma * np.exp(np.linalg.slogdet(covariance / np.outer(sigma, sigma))[1] / (2 * len(sigma)))
+        return replace(self, off_sigma=np.maximum(sigma, _WIDER * self.sigma), off=0.5)
 
     def reported(self, sigma: FloatArray) -> FloatArray:
         """Standard deviations as they are reported: zeros where only rounding is left; shape (n,)."""

@@ -39,6 +39,7 @@ class Block:
         sigma: Of their prior, shape (n,).
         stated: How well they are known where what they describe is as specified, shape (n,); zeros: exactly.
         held: They are reported as zero in any case.
+        off: Probability that they are not zero, before any data.
     """
 
     where: slice
@@ -46,6 +47,7 @@ class Block:
     sigma: FloatArray
     stated: FloatArray
     held: bool = False
+    off: float = OFF
 
     @classmethod
     def of(cls, where: slice, values: FloatArray, sigma: float) -> Block:
@@ -55,7 +57,7 @@ class Block:
     @classmethod
     def of_lens(cls, where: slice, lens: FixedLens, now: FloatArray) -> Block:
         """Make that of a fixed lens; `now`: fx fy cx cy and the distortion as estimated, shape (n,)."""
-        return cls(where, now - lens.values, lens.off_sigma, lens.sigma, held=True)
+        return cls(where, now - lens.values, lens.off_sigma, lens.sigma, held=True, off=lens.off)
 
     @property
     def share(self) -> FloatArray:
@@ -81,7 +83,7 @@ def hypotheses(S: FloatArray, every: Mapping[str, Block], less: float) -> Weight
     rows = np.concatenate([S[b.where] / b.sigma[:, None] for b in every.values()])
     values = {name: b.values / b.sigma for name, b in every.items()}
     shares = {name: b.share for name, b in every.items() if b.stated.any()}
-    return posterior(values, rows @ rows.T, less, shares)
+    return posterior(values, rows @ rows.T, less, shares, {name: b.off for name, b in every.items()})
 
 
 def not_zero(shares: Weights, name: str) -> float:
@@ -211,23 +213,25 @@ def posterior(
     covariance: FloatArray,
     less: float,
     shares: Mapping[str, FloatArray] | None = None,
+    off: Mapping[str, float] | None = None,
 ) -> Weights:
-    """Probability of each hypothesis, named by the blocks that are zero; each is in nineteen rigs of twenty.
+    """Probability of each hypothesis, named by the blocks that are zero.
 
     Args:
         values: Of each block, as estimated, over the sigma of its prior.
         covariance: Of all of them, in order, shape (n, n).
         less: As the factor of `log_bayes_factor`.
         shares: As its `share`, of the blocks that have one.
+        off: As its `off`; None: each is zero in nineteen rigs of twenty.
     """
     ends = np.cumsum([len(x) for x in values.values()])
     places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
     every = np.concatenate([np.zeros(0), *values.values()])
     stated = [(shares or {}).get(name, np.zeros(len(x))) for name, x in values.items()]
     share = np.concatenate(stated) if shares else None
-    logs = {}
+    logs, priors = {}, dict.fromkeys(values, OFF) | dict(off or {})
     for true in (c for n in range(len(values) + 1) for c in combinations(values, n)):
-        logs[true] = len(true) * np.log(1.0 - OFF) + (len(values) - len(true)) * np.log(OFF)
+        logs[true] = sum(np.log(1.0 - p if name in true else p) for name, p in priors.items())
         if true:
             at = np.concatenate([places[name] for name in true])
             near = None if share is None else share[at]

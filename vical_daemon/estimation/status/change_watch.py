@@ -73,7 +73,7 @@ class DriftWatch:
         return bool(far > SURE_SIGMAS)
 
 
-_IMAGES = 10
+IMAGES = 10
 """Images refused in a row after which the pose is found again, and images after an alarm that show what has
 changed."""
 _SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
@@ -94,6 +94,11 @@ class Action(Enum):
     RESTART = auto()
     SKEW = auto()
     WANDER = auto()
+
+    @property
+    def asks(self) -> bool:
+        """Whether to look for what has jumped."""
+        return self in (Action.ASK, Action.POSE, Action.RESTART)
 
 
 def suspect(f: CalibrationFilter, frame: PointsFrame) -> str:
@@ -154,7 +159,7 @@ class ChangeWatch:
         if not report.used:
             consistency.refused()
         soon = t < self._pose_taken_s + _SOON_S
-        if not report.used and refused >= _IMAGES:
+        if not report.used and refused >= IMAGES:
             self._refused[report.camera] = 0
             self.why = Cause.IMAGES_REFUSED
             if soon:
@@ -164,7 +169,7 @@ class ChangeWatch:
         if consistency.alarmed:
             consistency.alarm = 0.0
             if not self._closer:
-                self._closer = _IMAGES
+                self._closer = IMAGES
         if self._closer:
             self._closer -= 1
             if not self._closer:
@@ -182,7 +187,7 @@ class ChangeWatch:
             self._suspected = 0
         if not self._suspected and consistency.suspicious:
             self._suspected_s, consistency.suspicion = t_s, 0.0
-            self._ask_at = _IMAGES
+            self._ask_at = IMAGES
         elif not self._suspected:
             return False
         self._suspected += 1

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import CameraEstimate
+from vical_daemon.estimation.significance import chi_square_limit
 
 _SIGMAS = 4.0
-IRRELEVANT_M, _IRRELEVANT_RAD, _IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
+IRRELEVANT_M, _IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 """Smaller changes are not announced, however significant: thermal play of a mount."""
 IRRELEVANT_PX = 1.0  # likewise of fx: 1 px at the edge of an image 90 deg wide
 
@@ -22,7 +23,7 @@ def differences(
 ) -> list[Event]:
     """Return the significant differences of a mounting from an earlier one that are not irrelevant.
 
-    Compares each component with the sum of both variances, and rotations as the angle about each axis.
+    Moves and turns are significant if their direction and size are, by the sum of both covariances.
 
     Args:
         camera: Name of the camera.
@@ -33,18 +34,17 @@ def differences(
     """
     old, new = before.T_imu_cam, now.T_imu_cam
     covariance = np.asarray(old.covariance) + np.asarray(new.covariance)
-    limit = _SIGMAS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     move_m = np.subtract(new.p_m, old.p_m)
     R_old, R_new = (so3.matrix_from_quat(np.asarray(pose.q_wxyz)) for pose in (old, new))
     turn_rad = so3.log(R_old.T @ R_new)
     shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
     found: list[tuple[EventKind, float, float]] = []
-    if np.any(np.abs(move_m) > np.maximum(limit[:3], IRRELEVANT_M)):
+    if _differs(move_m, covariance[:3, :3], IRRELEVANT_M):
         found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
-    if np.any(np.abs(turn_rad) > np.maximum(limit[3:], _IRRELEVANT_RAD)):
+    if _differs(turn_rad, covariance[3:, 3:], _IRRELEVANT_RAD):
         found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
     sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
-    if abs(shift_s) > max(_SIGMAS * sigma_s, _IRRELEVANT_S):
+    if abs(shift_s) > max(_SIGMAS * sigma_s, IRRELEVANT_S):
         found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
     return [Event(kind, camera, value, sigma, t_s, cause) for kind, value, sigma in found]
 
@@ -61,7 +61,17 @@ def lens_difference(camera: str, before: CameraEstimate, now: CameraEstimate, t_
 def visible_move_m(before: CameraEstimate, now: CameraEstimate) -> float:
     """Return the least move of a camera, in any direction, that `differences` reports, m."""
     covariance = np.asarray(before.T_imu_cam.covariance) + np.asarray(now.T_imu_cam.covariance)
-    return max(IRRELEVANT_M, _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0)))
+    widest = max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0)
+    return max(IRRELEVANT_M, math.sqrt(chi_square_limit(3, _SIGMAS) * widest))
+
+
+def _differs(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64], irrelevant: float) -> bool:
+    """Whether a vector is longer than `irrelevant`, and not zero by its covariance, shape (3, 3)."""
+    if float(np.linalg.norm(vector)) <= irrelevant:
+        return False
+    values, axes = np.linalg.eigh(covariance)  # one of a fixed mounting is zero
+    along = (axes.T @ vector) ** 2
+    return bool(np.sum(along / np.maximum(values, 1e-12 * irrelevant**2)) > chi_square_limit(3, _SIGMAS))
 
 
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:

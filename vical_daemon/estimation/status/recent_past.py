@@ -47,6 +47,10 @@ class RecentPast:
         if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + EVERY_S:
             self._copies.append(deepcopy(f))
 
+    def changed(self, f: CalibrationFilter) -> None:
+        """Go on with another filter: copies from before know of no change."""
+        self._copies = deque([deepcopy(f)])
+
     def filter(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter as it was before a change that is noticed now, or as long ago as it is remembered."""
         return deepcopy(self._copies[0] if self._copies else f)

@@ -15,6 +15,7 @@ from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import OFF, SURE
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
@@ -100,6 +101,14 @@ class StatusEvaluator(Evaluator):
         if self._named:
             self.announce_change(why)
 
+    def nothing_changed(self, t_s: float) -> None:
+        """Images at `t_s` fit what was known before a change, which is known again."""
+        self.jumped(t_s)
+        if self._named:
+            same = {name: visible_move_m(before, before) for name, before in self._before.items()}
+            self.announce_all(Event(EventKind.NOT_BUMPED, name, visible) for name, visible in same.items())
+        self._before, self._named = {}, True
+
     def changed(self, why: Cause) -> None:
         """The rig has changed: the calibration is found again."""
         self._named = True
@@ -178,7 +187,7 @@ class StatusEvaluator(Evaluator):
         if f is None and stale is not None and self._ever_converged:
             self._before = self._before or cameras
         elif f is not None and self._before and cameras.keys() >= self._before.keys():  # none is absent
-            self._report_change(cameras, f.state.t_s)
+            self._report_change(cameras, f.state.t_s, doubt=_lens_may_have_jumped(f, shares))
         return self._put_together(
             reported,
             cameras,
@@ -190,13 +199,19 @@ class StatusEvaluator(Evaluator):
             refused=self._points[0] / max(self._points[1], 1),
         )
 
-    def _report_change(self, now: dict[str, CameraEstimate], t_s: float) -> None:
-        """Name what has changed as soon as that is known; once it is known well, report by how much."""
+    def _report_change(self, now: dict[str, CameraEstimate], t_s: float, *, doubt: bool) -> None:
+        """Name what has changed as soon as that is known; once it is known well, report by how much.
+
+        Args:
+            now: The cameras.
+            t_s: Time, s.
+            doubt: A fixed lens may have changed instead: the mounting for its values is then another, too.
+        """
         moved, lens = {}, {}
         for name, before in self._before.items():
             moved[name] = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
             lens[name] = lens_difference(name, before, now[name], self.elapsed_s)
-        if not self._named and any(moved.values()):
+        if not self._named and not doubt and any(moved.values()):
             self._named = True
             self.announce_change(Cause.IMAGES_DISAGREE)
         since_s = t_s - max(self._started_s or 0.0, self._reopened_s)
@@ -285,6 +300,13 @@ class StatusEvaluator(Evaluator):
         if len(self._squares) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
+
+
+def _lens_may_have_jumped(f: CalibrationFilter, shares: model_mixture.Weights | None) -> bool:
+    """Whether it is open which of a mounting and a fixed lens has changed."""
+    held = [name for name, lens in f.layout.held.items() if lens.off > OFF]
+    blocks = [model_mixture.lens_block(name) for name in held]
+    return shares is not None and any(model_mixture.not_zero(shares, x) > 1.0 - SURE for x in blocks)
 
 
 def _seen(f: CalibrationFilter) -> list[str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from enum import Enum, auto
 from typing import NamedTuple
 
@@ -78,7 +79,7 @@ def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
     sigmas = np.repeat([_TURN_RAD, _MOVE_M], 3)
     if camera in mountings:
         out[Part.MOUNTING] = _columns(layout.size, mountings[camera], sigmas)
-    if where.intrinsics is not None and layout.lens_free(camera):
+    if where.intrinsics is not None:  # of a fixed lens, too: its errors are considered
         focal = float(f.state.cameras[camera].intrinsics[0])
         out[Part.LENS] = _columns(
             layout.size, every[where.intrinsics], focal * np.repeat([_ZOOM, _SHIFTED], 2)
@@ -132,11 +133,15 @@ class Found(NamedTuple):
         filter: After the images; the possible parts are unknown to it from the jump on. If only the target
             may have moved: just before the jump, as the motion is found again as after any lost pose. If no
             jump explains the images: the filter given.
+        before: The filter just before the jump.
+        at: The image that it has not taken yet.
     """
 
     part: Part
     possible: frozenset[Part]
     filter: CalibrationFilter
+    before: CalibrationFilter
+    at: int = 0
 
 
 def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found:
@@ -164,22 +169,22 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
                 found[part] = jump
         likelihood += _follow(f, image, step)[0]
     if not found:
-        return Found(Part.NONE, frozenset(), before)
+        return Found(Part.NONE, frozenset(), before, before)
     best = max(found, key=lambda part: found[part].likelihood)
     total, k, _ = found[best]
     possible = {part for part, other in found.items() if other.likelihood > total - odds}
     if possible & {Part.MOUNTING, Part.IMU}:  # which are special cases of it
         possible.discard(Part.MOUNTINGS)
     if total > none + odds and possible == {Part.TARGET}:
-        return Found(best, frozenset(possible), filters[k])
+        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k], k)
     if total > none + odds:
         unknown = {part: found[part].sizes for part in possible}
         after = _follow_after(filters[k], unknown, images[k:], camera, step)
         for consistency in after.filter.consistency.values():
             consistency.settle()
         if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
-            return Found(best, frozenset(possible), after.filter)
-    return Found(Part.NONE, frozenset(), before)
+            return Found(best, frozenset(possible), after.filter, filters[k], k)
+    return Found(Part.NONE, frozenset(), before, before)
 
 
 def _most(used: Sequence[bool]) -> bool:
@@ -233,6 +238,11 @@ def _follow_after(
     f.jumped = jumped = JumpSizes.of(columns)
     if Part.LENS in parts:  # what stretches of the data said about it no longer holds
         f.agreement[camera] = LensAgreement(f.agreement[camera].model)
+        held = dict(f.layout.held)
+        if camera in held:
+            rows = f.S[f.layout.lens(camera)]
+            held[camera] = held[camera].may_have_jumped(rows @ rows.T)
+            f.layout = replace(f.layout, held=held)
     likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
     f.jumped = None
     return _After(f, sum(likelihoods), used, jumped.sizes)

@@ -196,6 +196,38 @@ def test_a_wrong_fixed_lens_is_announced_and_nothing_beyond_its_sigmas_is_said(r
     assert "the fixed lens of cam0 is not this camera's: leave it free" in estimate.reason
 
 
+def test_a_fixed_lens_that_is_zoomed_is_no_bump():
+    """Only other causes were tested: the lever arm ended 42 sigma off, `converged`, announced as a bump."""
+    true = simulate(9001, 19.0, rig=reference_rig(9001, timeshift_cam_imu_s=0.02))
+    middle, far, events = np.array(true.rig.lens.intrinsics[2:]), [], []
+    zoomed = [
+        f if f.t_s < 14.0 else replace(f, uv_px=middle + 1.02 * (f.uv_px - middle)) for f in true.frames
+    ]
+
+    def each(c):
+        estimate = c.estimate()
+        events.extend(e.kind for e in estimate.events)
+        if estimate.cameras and c.filter.state.t_s > 17.0:
+            x, sigma = errors(estimate, true)
+            far.append(float(np.abs(x / sigma).max()))
+
+    calibrate(replace(true, frames=zoomed), HELD, each=each)
+    assert EventKind.FIXED_LENS in events
+    assert not {EventKind.BUMPED, EventKind.NOT_BUMPED, EventKind.STARTED_ANEW} & set(events)
+    assert max(far) < 4.0
+
+
+def test_a_lens_that_may_have_jumped_is_as_likely_another_as_the_same():
+    """What images have said of the distortion, which has not jumped, says nothing about the focal length."""
+    lens = Linear(off=0.0).lens
+    sigma = np.array([9.0, 9.0, 5.0, 5.0, 1e-3, 1e-3, 1e-4, 1e-4])
+    S = sigma[:, None] * np.tril(np.full((8, 8), 0.9))  # correlated, as values of a lens are
+    block = model_mixture.Block.of_lens(slice(0, 8), lens.may_have_jumped(S @ S.T), lens.values)
+    for size, most, least in ((1.0, 0.5, 0.5), (0.03, 1e-4, 0.0)):  # nothing known yet; known to be as given
+        p = model_mixture.hypotheses(S * np.repeat([size, 1.0], 4), {"lens": block}, 1.0)
+        assert least - 1e-6 <= model_mixture.not_zero(p, "lens") <= most + 1e-6
+
+
 def test_a_right_fixed_lens_is_not_doubted(run):
     c = calibrate(run, HELD)
     estimate = c.estimate()

@@ -15,6 +15,7 @@ from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.status.mounting_changes import differences, visible_move_m
 
 AT_S, END_S = 12.0, 26.0
 MOVE_M, TURN_RAD = (0.008, -0.006, 0.0), (0.0, 0.025, -0.025)
@@ -117,3 +118,18 @@ def test_a_camera_that_is_absent_after_a_new_start_is_not_compared() -> None:
     evaluator, known = subject.calibrator.evaluator, subject.calibrator.estimate().cameras
     evaluator._before = {"cam0": known["cam0"], "cam1": known["cam0"]}
     assert list(subject.calibrator.estimate().cameras) == ["cam0"]
+
+
+def test_a_move_along_no_axis_is_a_move() -> None:
+    """Components of 1.7 mm each had been `not_bumped`, "by more than 2.0 mm would show"."""
+    run = simulate(31, 8.0, rig=reference_rig(31))
+    prior = camera_prior(run, 31, StartErrors(), exact_lens=True)
+    subject = CalibratorSubject(CalibrationOptions(), prior, run.points_m)
+    feed(run, subject)
+    (known,) = subject.calibrator.estimate().cameras.values()
+    sure = replace(known.T_imu_cam, covariance=(1e-10 * np.eye(6)).tolist())
+    before = replace(known, T_imu_cam=sure)
+    for each_m, kinds in ((1.7e-3, [EventKind.CAMERA_MOVED]), (1.1e-3, [])):
+        now = replace(before, T_imu_cam=replace(sure, p_m=[x + each_m for x in sure.p_m]))
+        assert visible_move_m(before, now) == pytest.approx(2e-3)
+        assert [e.kind for e in differences("cam0", before, now, 8.0, Cause.BUMPED)] == kinds
