@@ -137,8 +137,8 @@ def linear_start(
         known: z, where it is known; the accelerometer bias is known to its prior in any case; None: zeros.
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
-        free_size: Find the size of the target, too. It does not scale the positions, whose noise would make it
-            small; its inverse scales the integrals of the readings.
+        free_size: Find the size of the target, too. Noise of positions that are scaled by it would make it
+            small; so its inverse scales the integrals of the readings.
         force_sigma: Of the acceleration at each instant, m/s^2: gravity times the error of an attitude.
     """
     n, z = len(p_world_cam), np.zeros(12) if known is None else known.copy()
