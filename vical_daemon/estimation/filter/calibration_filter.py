@@ -32,6 +32,7 @@ from vical_daemon.estimation.filter.linearise import (
     LinearityMonitor,
     by_derivatives,
     by_sigma_points,
+    is_rolling,
     view_derivatives,
 )
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
@@ -288,8 +289,7 @@ class CalibrationFilter:
 
     def _linearise(self, image: Image) -> Linear:
         """The image about the nominal state, with the spread of the prior."""
-        where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
-        rolling = where.readout is not None or known.readout_s != 0.0
+        rolling = is_rolling(self.state, self.layout, image.camera)
         straight, sigmas = self._view_straight.setdefault(image.camera, LinearityMonitor()), self.sigmas()
         if not rolling and straight.holds(sigmas):
             return self._with_shared(

@@ -12,6 +12,7 @@ all rows of an image goes through fourteen columns.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +31,7 @@ _FLAT = 0.02  # second-order part over corner noise below which the model is str
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
 _FAR_PX = 1e5  # pixels of a point that is not in front of the camera
 _STEP = 1e-3  # of a sigma: so small that differences are derivatives
+_ROW_STEPS = 2  # to the row that shows a corner; each leaves a tenth of the error at most
 _TRUST = 100  # images for which a measurement of the second-order part holds
 
 
@@ -109,13 +111,13 @@ def project_errors(
         camera: Name.
         t_cam_s: Image stamp, s since the base.
         points: Points of the target, m, shape (n, 3).
-        uv: Measured pixels (rows of a rolling shutter), shape (n, 2); None: as a global shutter sees them.
+        uv: Pixels that tell the rows of a rolling shutter, shape (n, 2); None: those predicted here.
         errors: Shape (S, size).
 
     Returns:
         Pixels, shape (S, n, 2).
     """
-    where, known = layout.cameras[camera], state.cameras[camera]
+    known = state.cameras[camera]
     motion = pose_points(state, errors)
     cam = camera_points(known, layout, camera, errors)
     world: FloatArray = points * state.target_scale
@@ -125,20 +127,35 @@ def project_errors(
         shapes = state.target_shape + errors[:, layout.target_shape]
         world = world + np.einsum("npm,sm->snp", layout.target_modes.fields(points), shapes)
     ahead = t_cam_s - state.t_s
-    rows = None
-    if where.readout is not None or known.readout_s != 0.0:
-        if uv is None:
-            uv = view(world, motion, cam, rates, ahead, known.distortion_model)[0]
-        rows = read_share(uv, known.resolution, known.readout_axis)
-    return view(world, motion, cam, rates, ahead, known.distortion_model, rows)
+    project = partial(view, world, motion, cam, rates, ahead, known.distortion_model)
+    if not is_rolling(state, layout, camera):
+        return project()
+    rows = None if uv is None else read_share(uv, known.resolution, known.readout_axis)
+    for _ in range(_ROW_STEPS if uv is None else 0):
+        rows = read_share(project(rows), known.resolution, known.readout_axis)
+    return project(rows)
+
+
+def is_rolling(state: State, layout: Layout, camera: str) -> bool:
+    """Whether a camera has a rolling shutter, or may have one."""
+    return layout.cameras[camera].readout is not None or state.cameras[camera].readout_s != 0.0
 
 
 def by_sigma_points(
     state: State, layout: Layout, rates: Rates, image: Image, dx: FloatArray, S: FloatArray
 ) -> Linear:
-    """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
+    """Statistical linearisation about `dx` with spread S (all in the chart of the prior).
+
+    Derivatives refer to the rows at which corners are expected: at the measured rows they would contain the
+    noise of the corners, and pass for information. The mean refers to the measured rows.
+    """
     errors = dx + unscented.offsets(S)
-    pixels = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
+    project = partial(project_errors, state, layout, rates, image.camera, image.t_cam_s, image.points)
+    if is_rolling(state, layout, image.camera):
+        pixels = project(project(None, errors[:1])[0], errors)
+        pixels += project(image.uv, errors[:1]) - pixels[:1]
+    else:
+        pixels = project(None, errors)
     with np.errstate(invalid="ignore"):  # nan is behind the camera
         valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_update import ImageFit, corner_gate
-from vical_daemon.estimation.filter.linearise import Image, Linear, by_derivatives, by_small_steps
+from vical_daemon.estimation.filter.linearise import Image, Linear, by_derivatives, by_small_steps, is_rolling
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
@@ -140,8 +140,7 @@ class LinearisedFilter(CalibrationFilter):
         """About the reference; the pixels are those of the mean."""
         views, key = self.known.views, (image.camera, image.t_ns)
         if key not in views:
-            rolling = self.layout.cameras[image.camera].readout is not None
-            rolling |= self.state.cameras[image.camera].readout_s != 0.0
+            rolling = is_rolling(self.state, self.layout, image.camera)
             derive = by_small_steps if rolling else by_derivatives
             views[key] = derive(self.state, self.layout, self.rates, image, self.S)
         lin = views[key]

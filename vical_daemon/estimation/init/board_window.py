@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.linearise import Image, by_small_steps, view_derivatives
+from vical_daemon.estimation.filter.linearise import Image, by_small_steps, is_rolling, view_derivatives
 from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
@@ -313,7 +313,7 @@ class BoardWindow:
             name, frame.t_cam_ns, t_cam_s, frame.ids, self._target[frame.ids], frame.uv_px, relative
         )
         state, where = self.at(node, name), self.layout.cameras[name]
-        if where.readout is not None or state.cameras[name].readout_s:
+        if is_rolling(state, self.layout, name):
             lin = by_small_steps(state, self.layout, node.rates, image, self._S)
             uv, ways, by_error = np.where(lin.valid[:, None], lin.z, np.nan), lin.ways, lin.by_error
         else:

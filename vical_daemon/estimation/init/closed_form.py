@@ -26,7 +26,7 @@ from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.numbering import numbered_differently
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
-from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, recent_poses
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
@@ -138,7 +138,7 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
     refused = StartResult(None, reason, motion_missing=True)
     for name, (lens, frames, _) in seen.items():
         since_s = data.frames[name][-1][0] - LONG_S
-        poses = recent_poses([x for x in frames if x[0] > since_s], lens, data.target)
+        poses = usable_poses([x for x in frames if x[0] > since_s], lens, data.target)
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < PARTIAL_S:
             return refused
         path = CameraPath(
@@ -192,7 +192,7 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
         fit.take_into(lens)
     lens.readout_s = readout_s
     frames = at_middle_row(given, readout_s, lens.resolution, lens.readout_axis)
-    return Seen(lens, frames, [] if axis else recent_poses(frames, lens, target)), axis
+    return Seen(lens, frames, [] if axis else usable_poses(frames, lens, target)), axis
 
 
 def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> TdIcpResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -13,7 +13,7 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
-from vical_daemon.estimation.init.attempts import Attempts, RestDetector
+from vical_daemon.estimation.init.attempts import LONG_S, Attempts, RestDetector
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rig_model import RigModel
@@ -25,7 +25,8 @@ from vical_daemon.estimation.wording import not_in_view
 
 MIN_SPAN_S = 3.0
 _WAIT_S = 2.0 * MIN_SPAN_S  # of images of one camera, for others that have not seen the target
-_MAX_FRAMES = 500
+_MAX_FRAMES = 500  # of each camera
+_KEEP_S = 1.25 * LONG_S  # of images, however many they are
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
 LATE_S = 2e-3
@@ -64,14 +65,20 @@ class Initializer:
         options: Switches.
         rig: Its model, which is changed where the data contradict it.
         step: Propagates a filter to an image and corrects it.
+        thinned: Chooses the images that a filter uses.
         off: What is known to be not as specified, see `CalibrationFilter.off`.
     """
 
     def __init__(
-        self, options: CalibrationOptions, rig: RigModel, step: Step, off: Collection[str] = ()
+        self,
+        options: CalibrationOptions,
+        rig: RigModel,
+        step: Step,
+        thinned: Callable[[Frames], Frames],
+        off: Collection[str] = (),
     ) -> None:
         self._options = replace(options, estimate=options.estimate | set(off))
-        self._rig, self._step, self._attempts = rig, step, Attempts(first_s=0.5)
+        self._rig, self._step, self._thinned, self._attempts = rig, step, thinned, Attempts(first_s=0.5)
         self._frames: dict[str, Frames] = {name: [] for name in rig.layout.cameras}
         self.anew()
 
@@ -86,15 +93,15 @@ class Initializer:
     def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
         """Keep images (stamp in the camera's clock in s, points).
 
-        Of too many, the older half is dropped, if the other half is long enough for a start; of a rest before
-        any motion, all but the last image.
+        Of too many, those are dropped that are older than a start needs; of a rest before any motion, all but
+        the last image.
         """
         for t_cam_s, frame in items:
             frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
             rest.take(t_cam_s, frame)
-            if len(frames) > _MAX_FRAMES and t_cam_s - frames[len(frames) // 2][0] > MIN_SPAN_S:
-                del frames[: len(frames) // 2]
+            while len(frames) > _MAX_FRAMES and t_cam_s - frames[0][0] > _KEEP_S:
+                del frames[0]
             if rest.rests_since(frames[0][0]):
                 for name, kept in self._frames.items():
                     self._frames[name] = [x for x in kept if x[0] >= t_cam_s]
@@ -185,7 +192,7 @@ class Initializer:
         other = None if result.size is None else Attempt(size=size * result.size)
         if result.state is None:
             return other or _none(result.reason, result.motion_missing)
-        images = frames_from([x for kept in frames.values() for x in kept], result.state)
+        images = self._thinned(frames_from([x for kept in frames.values() for x in kept], result.state))
         others = {name: starting_camera(rig.priors[name]) for name in short}
         state = replace(result.state, cameras={**result.state.cameras, **others})
         make = partial(

@@ -22,7 +22,7 @@ from vical_daemon.estimation.init.initializer import MIN_SPAN_S, Attempt, frames
 from vical_daemon.estimation.init.numbering import late_numbered_differently
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
-from vical_daemon.estimation.init.target_poses import TargetPose, recent_poses
+from vical_daemon.estimation.init.target_poses import TargetPose, usable_poses
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, Frames, PointsFrame
 
@@ -124,5 +124,5 @@ class LateCameras:
         for name, camera in known.state.cameras.items():
             own = [x for x in images if x[1].camera == name and name not in known.absent]
             own = at_middle_row(own, camera.readout_s, camera.resolution, camera.readout_axis)
-            out += recent_poses(own, camera, self._rig.target)
+            out += usable_poses(own, camera, self._rig.target)
         return out

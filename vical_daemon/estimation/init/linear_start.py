@@ -137,16 +137,17 @@ def linear_start(
         known: z, where it is known; the accelerometer bias is known to its prior in any case; None: zeros.
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
-        free_size: Find the size of the target, too, by which positions scale.
+        free_size: Find the size of the target, too. Noise of positions that are scaled by it would make it
+            small; so its inverse scales the integrals of the readings.
         force_sigma: Of the acceleration at each instant, m/s^2: gravity times the error of an attitude.
     """
     n, z = len(p_world_cam), np.zeros(12) if known is None else known.copy()
     free = np.concatenate([np.arange(12)[part] for part in unknown])
     fixed = np.setdiff1d(np.arange(12), free)
     columns = [motion.A[:, :, free], np.broadcast_to(np.eye(3), (n, 3, 3))]  # z and p_0
-    columns += [-p_world_cam[:, :, None]] if free_size else []
+    columns += [motion.D[:, :, None]] if free_size else []
     A = np.concatenate(columns, axis=2)
-    left = (0.0 if free_size else p_world_cam) - motion.D - motion.A[:, :, fixed] @ z[fixed]
+    left = p_world_cam - (0.0 if free_size else motion.D) - motion.A[:, :, fixed] @ z[fixed]
     noise = np.diag(position_sigma**2) + drift_covariance(motion.T, force_sigma)
     both = np.concatenate([A, left[:, :, None]], axis=2)
     white = solve_triangular(np.linalg.cholesky(noise), both.reshape(n, -1), lower=True).reshape(3 * n, -1)
@@ -160,10 +161,14 @@ def linear_start(
     x, *_ = np.linalg.lstsq(A_all, np.concatenate([y, prior[:, free] @ z[free]]), rcond=None)
     variance = float(np.mean((y - rows @ x) ** 2))
     sigma = np.sqrt(np.diag(np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)))
-    z[free], k = x[: len(free)], len(free)
+    k, size = len(free), (1.0, 0.0)
+    if free_size:  # all of x is in stated sizes: the integrals times 1/s
+        s = 1.0 / float(x[-1])
+        size = (s, float(sigma[-1]) * s * s)
+        x, sigma = x * s, sigma * abs(s)
+    z[free] = x[:k]
     sigmas = np.zeros(12)
     sigmas[free] = sigma[:k]
-    size = (float(x[k + 3]), float(sigma[k + 3])) if free_size else (1.0, 0.0)
     return LinearStart(x[k : k + 3], z[SPEED], z[GRAVITY], z[ARM], z[BIAS], sigmas[ARM], *size)
 
 

@@ -18,7 +18,6 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.state import CameraState
 
-_MOST_POSES = 160
 _CORNER_PX = 0.2  # no orientation is better than a corner's position over the focal length
 _CLEANINGS = 3  # a gross outlier may hide lesser ones
 
@@ -110,9 +109,8 @@ def _cleaned(views: dict[int, tuple[FloatArray, FloatArray]], k: int, pose: Plan
     return True
 
 
-def recent_poses(
+def usable_poses(
     frames: Sequence[tuple[float, PointsFrame]], lens: CameraState, target: FloatArray
 ) -> list[TargetPose]:
-    """Poses of at most 160 of the frames (stamp in s, points), evenly thinned, in order of time."""
-    step = max(1, -(-len(frames) // _MOST_POSES))
-    return [p for p in poses_of(frames[::-1][::step][::-1], lens, target) if p is not None]
+    """Poses of those of the frames (stamp in s, points) that show one, in order of time."""
+    return [p for p in poses_of(frames, lens, target) if p is not None]

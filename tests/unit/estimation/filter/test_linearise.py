@@ -1,5 +1,7 @@
 """Derivatives of the two models: against differences of the models themselves, and against sigma points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,25 @@ def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     )
     np.testing.assert_allclose(straight.z, points.z, atol=1e-4)
     assert straight.curved.shape == (2 * len(image.points), 0)
+
+
+def test_rows_of_a_rolling_shutter_put_no_noise_of_the_corners_into_derivatives():
+    """An image of which only the noise differs has the same derivatives: noise is no information."""
+    state, layout, rates, image = scene("radtan")
+    state.cameras["cam0"].readout_s = 0.02
+    nominal, S = np.zeros(layout.size), np.diag(np.full(layout.size, 1e-3))
+    seen = project_errors(state, layout, rates, "cam0", image.t_cam_s, image.points, None, nominal[None])[0]
+    noise = np.random.default_rng(3).standard_normal(seen.shape)
+    clean, noisy = (
+        by_sigma_points(state, layout, rates, replace(image, uv=uv), nominal, S)
+        for uv in (seen, seen + noise)
+    )
+    np.testing.assert_array_equal(noisy.ways, clean.ways)
+    np.testing.assert_array_equal(noisy.curved, clean.curved)
+    # the innovation is the noise, but for what a corner moves until the row in which it seems to be
+    np.testing.assert_allclose(seen - clean.z, 0.0, atol=0.05)
+    np.testing.assert_allclose(seen + noise - noisy.z, noise, atol=0.15)
+    assert np.abs(noisy.z - clean.z).max() > 0.01
 
 
 def test_points_behind_the_camera_are_invalid_either_way():

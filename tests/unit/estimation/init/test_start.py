@@ -113,6 +113,14 @@ def test_a_fast_camera_starts():
     within(record, 4.5)
 
 
+def test_rotations_of_a_start_are_taken_from_all_images():
+    """Slow motion, many images: the filter uses ten a second, with which there was no start within 12 s."""
+    run = simulate(3, 9.5, rig=reference_rig(3, mean_rate_dps=14.0), camera_rate_hz=60.0, corner_sigma_px=0.8)
+    record, _ = answer(run, lens_known=True)
+    assert record.started_s() <= 9.1
+    within(record, 4.0)
+
+
 def test_very_sharp_corners_start_at_once():
     """With 0.01 px a first run, far from straight, refused what followed: 7 s until the first answer."""
     rig = rig_before(APRILGRID, 0.8, 4, timeshift_cam_imu_s=-0.027)
