@@ -330,7 +330,7 @@ class Calibrator:
         if f.unobservable is None and self._change is None and not self.watch.undecided:
             for block, event in self._acceptance.look(f).items():
                 self.evaluator.announce(event, once=block)
-        self._act(self.watch.look(report, f), frame)
+        self._act(self.watch.look(report, f, early=self.evaluator.confirms(f.state.t_s)), frame)
         return [report]
 
     def _note(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:

@@ -150,8 +150,15 @@ class ChangeWatch:
         """Something may have changed: what, is not known yet."""
         return bool(self._closer or any(self._refused.values()) or self._suspected)
 
-    def look(self, report: FrameReport, f: CalibrationFilter) -> Action:
-        """Say what is to be done after this image."""
+    def look(self, report: FrameReport, f: CalibrationFilter, *, early: bool = True) -> Action:
+        """Say what is to be done after this image.
+
+        Args:
+            report: Its verdict.
+            f: The filter after it.
+            early: Look for what has jumped at the first signs. In the first seconds of a calibration they
+                are more likely to be errors of lens and target that last, which are not measured yet.
+        """
         t = f.state.t_s
         refused = self._refused.get(report.camera, 0) + 1
         self._refused[report.camera] = 0 if report.used else refused
@@ -175,7 +182,7 @@ class ChangeWatch:
             if not self._closer:
                 self.why = Cause.IMAGES_DISAGREE
                 return Action.RESTART
-        if self._asks(consistency, t):
+        if early and self._asks(consistency, t):
             return Action.ASK
         if self.undecided:
             return Action.NONE

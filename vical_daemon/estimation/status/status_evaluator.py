@@ -128,6 +128,10 @@ class StatusEvaluator(Evaluator):
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
 
+    def confirms(self, t_s: float) -> bool:
+        """Whether enough has been seen since the start, up to `t_s`, to confirm what the sigmas say."""
+        return self.frames >= _RECENT and t_s - (self._started_s or 0.0) >= _ENOUGH_S
+
     def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the verdict of one frame."""
         accepted = int(np.count_nonzero(report.accepted))
@@ -269,7 +273,6 @@ class StatusEvaluator(Evaluator):
         trouble = self._trouble()
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
-        span = f.state.t_s - (self._started_s or 0.0)
         weak = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
         lacking = self._steady.counted(weak)
         if not lacking:
@@ -277,8 +280,7 @@ class StatusEvaluator(Evaluator):
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
             if f.absent:
                 return Verdict(Status.CONVERGING, self.not_joined or not_in_view(f.absent))
-            enough = self.frames >= _RECENT and span >= _ENOUGH_S
-            return self._once_known(enough=enough, doubt=self.in_doubt)
+            return self._once_known(enough=self.confirms(f.state.t_s), doubt=self.in_doubt)
         lens = self._lens_to_blame(f, missing)
         if lens:
             return lens_verdict(lacking[0], lens, off=model_mixture.lens_block(lens) in f.off)
