@@ -65,7 +65,7 @@ def _level(
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
     if queue.dropped:
         rate = f"{health.stats.rate_hz:.1f} Hz; " if health.stats.rate_hz else ""
-        return Level.WARN, f"{rate}{queue.dropped} samples dropped since the start: the bus is too slow"
+        return Level.WARN, f"{rate}{queue.dropped} samples dropped: the bus is too slow (since the start)"
     if health.stats.rate_hz and abs(health.stats.rate_hz / nominal_rate_hz - 1) > 0.1:
         return Level.WARN, f"{health.stats.rate_hz:.1f} Hz instead of {nominal_rate_hz:g} Hz"
     return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost"

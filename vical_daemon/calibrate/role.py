@@ -20,7 +20,7 @@ from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.checkpoint import Checkpoint
 from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.calibrate.persistence import CalibrationPersistence
-from vical_daemon.calibrate.worker import PUBLISH_S, STUCK_S, EstimateRole
+from vical_daemon.calibrate.worker import PUBLISH_S, STEP_STUCK_S, STUCK_S, EstimateRole
 from vical_daemon.config.model import Config
 from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.estimation.events import Event, EventKind
@@ -37,9 +37,6 @@ Until = Callable[[CalibrationEstimate | None, set[str]], bool]
 _log = logging.getLogger(__name__)
 QUEUE_LIMIT = 20_000  # samples: 20 s at 1000 Hz, which may arrive while the estimator starts
 _BACKLOG_S = 1.0  # images sometimes wait this long
-_STEP_STUCK_S = 60.0
-"""No step takes so long: a start takes 0.3 to 2.4 s of CPU time on a current core, and a small computer is
-four to five times slower and does other things as well."""
 _OURS = "vical_daemon/"  # in the path of our code
 
 
@@ -91,7 +88,7 @@ def calibrate(
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
-    status.repeat_while_busy(_STEP_STUCK_S)
+    status.repeat_while_busy(STEP_STUCK_S)
     while not stop.is_set():
         queue.wait(PUBLISH_S / 2)
         words = _commands(commands)

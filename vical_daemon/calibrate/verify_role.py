@@ -36,6 +36,7 @@ from vical_daemon.calibrate.publications import calibration_messages, companion_
 from vical_daemon.calibrate.stretch import Stretch
 from vical_daemon.calibrate.verification import Verification
 from vical_daemon.calibrate.verify_words import age, line, status
+from vical_daemon.calibrate.worker import STEP_STUCK_S
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, Status
@@ -81,6 +82,7 @@ class _VerifyService:
         self._verification: Verification | None = None
         self._persistence.priors()
         self._read_in_use()
+        self._status.repeat_while_busy(STEP_STUCK_S)
 
     def loop(self) -> None:
         """Check, rest, calibrate when asked to, until the role is stopped."""
@@ -97,6 +99,7 @@ class _VerifyService:
         self._commands.close()
         self._persistence.close(None)
         self._set(CheckState.RESTING)
+        self._status.finish(self._statuses)
 
     # -------------------------------------------------------------------------------------- what is checked
     def _read_in_use(self) -> None:
@@ -204,6 +207,7 @@ class _VerifyService:
         from vical_daemon.calibrate.role import calibrate
 
         _log.info("calibrating")
+        self._status.pause()
         self._set(CheckState.CALIBRATING, self._config.calibration.detect_rate_hz)
         converged_s = np.inf
 

@@ -44,6 +44,9 @@ COMPANION_S = 1.0
 STUCK_S = 10.0
 """The estimator is stuck if images arrive and none is used or rejected for this long, s. Images wait at most
 2 s for inertial data; a start on a slow card took 3 s."""
+STEP_STUCK_S = 60.0
+"""No step takes so long: a start takes 0.3 to 2.4 s of CPU time on a current core, and a small computer is
+four to five times slower and does other things as well."""
 
 
 class EstimateRole:

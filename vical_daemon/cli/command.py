@@ -31,7 +31,7 @@ _OF_VERIFY = ("check", "calibrate", "verify")  # have an effect only with `mode:
 _BUS_S = 3.0
 _ANSWER_S = 5.0  # estimates come five times a second
 _STATUS_S = 2.0  # within this time a role has said how it is
-_BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.role`
+_BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.worker`
 _EPILOG = """\
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began

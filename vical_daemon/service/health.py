@@ -93,12 +93,16 @@ class StatusSender:
         name = f"status/{self._role}"
         threading.Thread(target=self._repeat, args=(stuck_s,), name=name, daemon=True).start()
 
+    def pause(self) -> None:
+        """Repeat nothing until the next `tick`: somebody else reports for the role."""
+        self._last = []
+
     def _repeat(self, stuck_s: float) -> None:
         while not self._finished.wait(STATUS_PERIOD_S):
-            busy_s = time.monotonic() - self._ticked_s
-            if not self._last or busy_s < STATUS_PERIOD_S:
+            busy_s, last = time.monotonic() - self._ticked_s, self._last
+            if not last or busy_s < STATUS_PERIOD_S:
                 continue
-            first, *others = self._last
+            first, *others = last
             if busy_s > stuck_s:
                 first = replace(first, level=Level.STALE, message=f"stuck: at one step for {busy_s:.0f} s")
             self._publish([first, *others])

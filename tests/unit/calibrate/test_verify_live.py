@@ -206,6 +206,7 @@ class Live:
             CalibrationStore(folder).save("I1", "C1", "cam0", estimate(run, turned_deg), T0_NS)
         self.bus, self.stop = LocalBus(), threading.Event()
         self.results, self.events, self.statuses, self.wanted = [], [], {}, []
+        self.heard_s: list[float] = []
         self.bus.subscribe(topics.VERIFY.key("rig0", "cam0"), self._verified)
         self.bus.subscribe(topics.CALIBRATION.key("rig0", "cam0"), self._calibrated)
         self.bus.subscribe(topics.STATUS.key("rig0", "estimate"), self._status)
@@ -227,6 +228,7 @@ class Live:
 
     def _status(self, sample):
         self.statuses = {s.name: s for s in decode_diagnostics(sample.payload).statuses}
+        self.heard_s.append(time.monotonic())
 
     def play(self, messages, until, speed=3.0):
         """Send messages at a multiple of their pace until something is true; points only if wanted."""
@@ -285,6 +287,21 @@ def test_the_role_publishes_answer_status_event_and_the_calibration_in_use(run, 
     assert [e.kind for e in role_run.events] == [EventKind.STORED_HOLDS]
     in_use = role_run.last.camera_estimate
     np.testing.assert_allclose(in_use.T_imu_cam.p_m, run.rig.p_imu_cam, atol=1e-12)
+
+
+def test_a_check_that_takes_long_at_one_step_is_not_taken_for_dead(run, live, messages, monkeypatch):
+    """A start on a small or busy computer: "estimate has been silent for 6 s" in the journal, not fed."""
+    steps: list[float] = []
+
+    def slow(_self) -> bool:
+        steps.append(time.monotonic())
+        time.sleep(3.5)
+        return False
+
+    monkeypatch.setattr(Verification, "step", slow)
+    role_run = live(run)
+    role_run.play(messages, lambda: len(steps) > 1)
+    assert sum(steps[0] < heard_s < steps[0] + 3.5 for heard_s in role_run.heard_s) >= 2
 
 
 def test_without_a_stored_calibration_it_says_what_to_do_and_calibrates_on_command(live, messages):

@@ -28,6 +28,11 @@ def test_a_busy_role_repeats_its_status_until_it_is_stuck(monkeypatch: pytest.Mo
     assert time.monotonic() >= begin_s + 2.0
     assert heard[-1].message.startswith("stuck: at one step for 2 s")
     assert len(heard) > 3 and {(s.level, s.message) for s in heard[1:3]} == {(Level.OK, "initialising")}
+    sender.pause()  # another one reports
+    time.sleep(0.1)
+    count = len(heard)
+    time.sleep(0.2)
+    assert len(heard) == count
     sender.finish(lambda: [DiagnosticStatus(Level.OK, "estimate", "converging")])
     time.sleep(0.2)
     count = len(heard)
