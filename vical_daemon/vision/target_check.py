@@ -26,9 +26,10 @@ MAX_MISFIT = 0.03
 images it is at most 0.02, also with a fisheye lens; with a wrong number of columns it is 1 to 3."""
 SPACING_ERROR = 0.01
 """Least difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
-_FIRST, _EVERY = 10, 30
-"""The first image that is checked, and how many lie between a finding and its confirmation; images from one
-check to the next. A check costs up to 0.3 s, the search for a board that is not there 20 ms an image."""
+_FIRST = 10  # the first image that is checked, and how many lie between a finding and its confirmation
+_EVERY, _RAREST, _RARER = 30, 150, 0.25
+"""Images from one check to the next: at first, at most, and as a share of all so far. A check takes 0.1 s,
+while a search for a board that is not there takes some milliseconds an image."""
 _TAGS_A_TURN = 4  # kinds of tags that one image is searched for
 _MAX_COLS = 30  # of boards that are tried
 _SPACINGS = np.geomspace(0.02, 2.0, 24)  # gaps over tags that are tried first
@@ -79,7 +80,8 @@ class TargetCheck:
         if self._settled or self._taken < self._next:
             return
         text = contradiction(gray, self._target, self._turn)
-        self._next = self._taken + (_FIRST if text else _EVERY)
+        later = min(max(_EVERY, round(_RARER * self._taken)), _RAREST)
+        self._next = self._taken + (_FIRST if text else later)
         if text is None:
             self._turn += 1
             return
