@@ -77,7 +77,8 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
         self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
-        self._held_back, self._acceptance = HoldoutCheck(), ModelAcceptance()
+        self._held_back = HoldoutCheck()
+        self._acceptance = ModelAcceptance()
         self._past = RecentPast()
         self._change: PendingChange | None = None  # the last, until images confirm it
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
@@ -85,7 +86,7 @@ class Calibrator:
 
     def _new_initializer(self, off: Collection[str] = ()) -> Initializer:
         """For a rig of which it is known what is not as specified."""
-        return Initializer(self.options, self.rig, self._step, self._pace.thinned, off)
+        return Initializer(self.options, self.rig, self._step, off)
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -121,8 +122,7 @@ class Calibrator:
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
-        used = self._pace.takes(frame.camera, t_cam_s, self.evaluator.motion.rate_change_rps2, self._buffer)
-        if used or self.filter is None:  # rotations of a start: all of them
+        if self._pace.takes(frame.camera, t_cam_s, self.evaluator.motion.rate_change_rps2, self._buffer):
             self._pending.push(t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer))
 
     def _clock_was_set(self, camera: str) -> None:

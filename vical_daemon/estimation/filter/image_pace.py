@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
-from vical_daemon.estimation.measurements import Frames, ImuNoise
+from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.rates import RATE_BLOCK_S
 
 _TIMES = 2.0
@@ -54,19 +54,6 @@ class ImagePace:
             self._next_look_s = now_s + _LOOK_S
             self._interval_s = interval_s(self._noise, rate_change_rps2, buffer)
         return self._thinning.setdefault(camera, Thinning()).takes(t_cam_s, self._interval_s)
-
-    def thinned(self, frames: Frames) -> Frames:
-        """Of images (stamp in the camera's clock in s, points) of a start, those to be used.
-
-        Args:
-            frames: Of all cameras, in order of time.
-        """
-        counts: dict[str, Thinning] = {}
-        return [
-            (t_s, frame)
-            for t_s, frame in frames
-            if counts.setdefault(frame.camera, Thinning()).takes(t_s, self._interval_s)
-        ]
 
 
 def interval_s(noise: ImuNoise, rate_change_rps2: float, buffer: ImuBuffer) -> float:

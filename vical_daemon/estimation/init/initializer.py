@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -65,20 +65,14 @@ class Initializer:
         options: Switches.
         rig: Its model, which is changed where the data contradict it.
         step: Propagates a filter to an image and corrects it.
-        thinned: Chooses the images that a filter uses.
         off: What is known to be not as specified, see `CalibrationFilter.off`.
     """
 
     def __init__(
-        self,
-        options: CalibrationOptions,
-        rig: RigModel,
-        step: Step,
-        thinned: Callable[[Frames], Frames],
-        off: Collection[str] = (),
+        self, options: CalibrationOptions, rig: RigModel, step: Step, off: Collection[str] = ()
     ) -> None:
         self._options = replace(options, estimate=options.estimate | set(off))
-        self._rig, self._step, self._thinned, self._attempts = rig, step, thinned, Attempts(first_s=0.5)
+        self._rig, self._step, self._attempts = rig, step, Attempts(first_s=0.5)
         self._frames: dict[str, Frames] = {name: [] for name in rig.layout.cameras}
         self.anew()
 
@@ -192,7 +186,7 @@ class Initializer:
         other = None if result.size is None else Attempt(size=size * result.size)
         if result.state is None:
             return other or _none(result.reason, result.motion_missing)
-        images = self._thinned(frames_from([x for kept in frames.values() for x in kept], result.state))
+        images = frames_from([x for kept in frames.values() for x in kept], result.state)
         others = {name: starting_camera(rig.priors[name]) for name in short}
         state = replace(result.state, cameras={**result.state.cameras, **others})
         make = partial(

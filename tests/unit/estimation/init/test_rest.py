@@ -47,7 +47,7 @@ def test_images_that_share_no_corners_show_no_rest():
 def test_no_start_is_tried_from_a_minute_at_rest_and_soon_from_what_follows():
     options = CalibrationOptions()
     rig = RigModel(options, {"cam0": CameraPrior((752, 480))}, board_points())
-    starting = Initializer(options, rig, None, list)
+    starting = Initializer(options, rig, None)
     rng, why = np.random.default_rng(2), None
     for t_s in np.arange(0.0, 60.0, 1.0 / RATE_HZ):
         starting.take([(t_s, image(t_s, 0.0, rng))])
