@@ -180,6 +180,9 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
     if total > none + odds:
         unknown = {part: found[part].sizes for part in possible}
         after = _follow_after(filters[k], unknown, images[k:], camera, step)
+        if possible <= MOVED and Part.SHIFT in instants:
+            both = _follow_after(filters[k], {**unknown, Part.SHIFT: 1.0}, images[k:], camera, step)
+            after = both if both.likelihood > after.likelihood + odds else after
         for consistency in after.filter.consistency.values():
             consistency.settle()
         if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
