@@ -158,7 +158,8 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
     found: dict[Part, _Jump] = {}
     filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
-    for k, image in enumerate(images):
+    last = max((k for at in instants.values() for k in at), default=-1)
+    for k, image in enumerate(images[: last + 1]):
         parts = [part for part, at in instants.items() if k in at]
         if parts:
             filters[k] = deepcopy(f)
