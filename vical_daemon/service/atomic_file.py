@@ -56,17 +56,15 @@ def write_output(path: Path, data: str | bytes) -> None:
     except FileNotFoundError:
         before = None
         place.parent.stat()  # `atomic_write` would make it
-    special = before is not None and not stat.S_ISREG(before.st_mode)
-    if special or (before is not None and not os.access(place.parent, os.W_OK)):
-        try:
-            path.write_bytes(content)
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        return
+    regular = before is None or stat.S_ISREG(before.st_mode)
+    replaces = regular and (before is None or os.access(place.parent, os.W_OK))
     try:
-        atomic_write(place, content)
+        if replaces:
+            atomic_write(place, content)
+        else:
+            path.write_bytes(content)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
-    if before is not None:
+    if before is not None and replaces:
         with suppress(OSError):  # another user's file
             place.chmod(stat.S_IMODE(before.st_mode))

@@ -28,16 +28,15 @@ SPACING_ERROR = 0.01
 """Least difference of tagSpacing that is reported: 1 mm for tags of 100 mm, what a ruler shows."""
 _FIRST = 10  # the first image that is checked, and how many lie between a finding and its confirmation
 _EVERY, _RAREST, _RARER = 30, 150, 0.25
-"""Images from one check to the next: at first, at most, and as a share of all so far. A check takes 0.1 s,
-while a search for a board that is not there takes some milliseconds an image."""
+"""Images from one check to the next: at first, at most, and as a share of all so far. A check takes
+0.1 to 0.2 s, while a search for a board that is not there takes some milliseconds an image."""
 _TAGS_A_TURN = 4  # kinds of tags that one image is searched for
 _MAX_COLS = 30  # of boards that are tried
 _SPACINGS = np.geomspace(0.02, 2.0, 24)  # gaps over tags that are tried first
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # of a tag, in edges
 _SMALLEST, _ANY_COUNTS = (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-_GOES_ON = (
-    0.3  # of the contrast of the squares, by which what lies around them alternates where a board goes on
-)
+_GOES_ON = 0.3
+"""Of the contrast of the squares: what lies around them alternates by more where a board goes on."""
 _FAMILIES = {
     "AprilTag 36h11": cv2.aruco.DICT_APRILTAG_36h11,
     "AprilTag 36h10": cv2.aruco.DICT_APRILTAG_36h10,

@@ -150,7 +150,7 @@ class ChangeWatch:
         """Something may have changed: what, is not known yet."""
         return bool(self._closer or any(self._refused.values()) or self._suspected)
 
-    def look(self, report: FrameReport, f: CalibrationFilter, *, early: bool = True) -> Action:
+    def look(self, report: FrameReport, f: CalibrationFilter, *, early: bool) -> Action:
         """Say what is to be done after this image.
 
         Args:
