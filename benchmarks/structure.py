@@ -72,8 +72,8 @@ class Sources:
             yield from ast.walk(tree)
 
 
-def named_constants(tree: ast.Module) -> Iterator[str]:
-    """Names in capitals that a module gives to numbers, or to tuples of numbers."""
+def named_constants(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
+    """Names in capitals that a module gives to numbers or to tuples of numbers, and where."""
     for node in tree.body:
         if isinstance(node, ast.Assign):
             targets, value = node.targets, node.value
@@ -87,7 +87,23 @@ def named_constants(tree: ast.Module) -> Iterator[str]:
                 pairs = list(zip(target.elts, value.elts, strict=True))
             for name, number in pairs:
                 if isinstance(name, ast.Name) and _CONSTANT.fullmatch(name.id) and _is_number(number):
-                    yield name.id
+                    yield name.id, node
+
+
+def unexplained_constants(tree: ast.Module, text: str) -> Iterator[tuple[str, int]]:
+    """Named constants, and their lines, that no comment explains and no docstring below.
+
+    A comment stands on a line of the constant, or above it and what else is assigned right there.
+    """
+    lines = ["", *text.splitlines(), ""]
+    assigned = {node.end_lineno: node for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign)}
+    for name, node in named_constants(tree):
+        first, last = node.lineno, node.end_lineno or node.lineno
+        own = "#" in "".join(lines[first : last + 1]) or lines[last + 1].startswith('"""')
+        while first - 1 in assigned:
+            first = assigned[first - 1].lineno
+        if not own and not lines[first - 1].startswith("#"):
+            yield name, node.lineno
 
 
 def _is_number(node: ast.expr) -> bool:

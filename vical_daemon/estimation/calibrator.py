@@ -44,7 +44,7 @@ from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
-_KEEP_S = 5.0
+_KEEP_S = 5.0  # of readings before the oldest image that may still be used
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 
 

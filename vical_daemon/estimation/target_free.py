@@ -48,11 +48,11 @@ from vical_daemon.estimation.status.evaluator import PATIENCE_S
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
-WINDOW_S = 6.0
-_MIN_PARALLAX_DEG = 0.4
-_KEEP_S = 12.0
+WINDOW_S = 6.0  # likewise, see `WINDOW_FRAMES`
+_MIN_PARALLAX_DEG = 0.4  # usual angle under which a landmark is seen: ten times the noise of a track
+_KEEP_S = 12.0  # of images that wait for a start or for inertial data
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
-_STEPS_GROW = 12
+_STEPS_GROW = 12  # Gauss-Newton steps for a window that grows; twice as many for its last fit
 _ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
 
 

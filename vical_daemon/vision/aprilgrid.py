@@ -18,8 +18,8 @@ from vical_daemon.vision.saddle import SaddleImage
 from vical_daemon.vision.tag_code import decode
 from vical_daemon.vision.target import AprilGrid
 
-MIN_EDGE_PX = 9.0
-MAX_CANDIDATES = 400
+MIN_EDGE_PX = 9.0  # of a tag: 0.9 px for each of its ten modules
+MAX_CANDIDATES = 400  # the largest outlines: over ten times the tags of a usual board
 FIRST_WIDTH_PX = 320
 """The first pass works on the picture halved until it is about this wide: most boards show there."""
 
@@ -41,7 +41,7 @@ class Pass:
 
 PASSES = (Pass(31, 1), Pass(31, 2), Pass(91, 2), Pass(31, 2, 2.0), Pass(15, 1))
 """Tried in turn until enough of the board is known, after passes over reduced pictures."""
-ENOUGH_TAGS = 6
+ENOUGH_TAGS = 6  # 24 corners: enough for a model of the board that finds the others
 
 
 def search_tags(

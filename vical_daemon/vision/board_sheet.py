@@ -21,10 +21,10 @@ PAPERS_MM: dict[str, tuple[float, float]] = {
     "legal": (215.9, 355.6),
     "tabloid": (279.4, 431.8),
 }
-MARGIN_MM = 8.0
-LABEL_MM = 5.0
-FOOTER_MM = 17.0
-TEXT_MM = 2.6
+MARGIN_MM = 8.0  # printers leave 4 to 6 mm of a page white
+LABEL_MM = 5.0  # beside the board, for the numbers of rows and columns
+FOOTER_MM = 17.0  # below it, for ruler and text
+TEXT_MM = 2.6  # height of letters: 7 pt
 RULER_MM = 100.0
 """Length of the ruler where the page is wide enough."""
 LINE_MM = 0.3

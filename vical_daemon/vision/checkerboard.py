@@ -19,9 +19,9 @@ from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage
 from vical_daemon.vision.target import Checkerboard
 
-LEAST_WIDTH_PX = 320
+LEAST_WIDTH_PX = 320  # of a reduced picture: a board of ten squares across half of it has 16 px for each
 QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-FULL_SIZE_EVERY = 3
+FULL_SIZE_EVERY = 3  # pictures without a board: the full size, which takes longest, is searched this rarely
 SLOW_EVERY = 20
 """Of pictures without a board: how often the quick finder looks at full size, and how often the slow one
 looks at all. On a picture without a board that costs up to 10 and 150 ms."""

@@ -23,17 +23,17 @@ from vical_daemon.vision.saddle import SaddleImage
 from vical_daemon.vision.target import AprilGrid, Target
 from vical_daemon.vision.target_check import TargetCheck
 
-MIN_POINTS = 4
-FLOW_POINTS = 24
+MIN_POINTS = 4  # as many as a pose needs
+FLOW_POINTS = 24  # corners followed: a homography needs four, and half may be lost
 FLOW_WIDTH_PX = 320
 """Optical flow works on pictures reduced to at least this width: the refinement needs only a pixel or two."""
-FLOW_WINDOW = (11, 11)
-FLOW_LEVELS = 2
+FLOW_WINDOW = (11, 11)  # px of the reduced picture
+FLOW_LEVELS = 2  # halvings: moves of 4 times half a window
 FLOW_TOLERANCE_PX = 3.0
 """From the common homography; beyond, the optical flow of a corner is wrong."""
 KEEP_SHARE = 0.5
 """Guided detection holds while it finds this share of the corners that should be in view."""
-MAX_GAP_NS = 400_000_000
+MAX_GAP_NS = 400_000_000  # between pictures, for the flow; a hand turns by 24 deg in it at 60 deg/s
 
 
 @dataclass

@@ -16,7 +16,7 @@ from vical_daemon.vision.detection import FloatArray, median
 
 HISTORY_SAMPLES = 400  # two seconds at 200 Hz
 _TOLERATED_PX = 2.0  # translation moves pixels too, and only the flow knows
-_FOLLOW = 0.2
+_FOLLOW = 0.2  # share of the newest picture in the errors of gyro and flow: a memory of five pictures
 _LEAST_POINTS = 8  # for an affine flow
 _NEAR_PX = 25.0  # flow farther from the median belongs to things that move
 _ROUND_PX = 1.0  # spread that points have at least: of points on one line the flow across is the mean flow

@@ -22,7 +22,7 @@ BoolArray = npt.NDArray[np.bool_]
 CONVERGED = 2e-3
 """Change of the (dimensionless) parameters that moves corners by about a pixel: what the next step would
 change is of second order in it."""
-MAX_LENS = 1.5
+MAX_LENS = 1.5  # bound of the lens coefficient: three sigmas of its prior
 LENS_PRIOR = 0.5
 """One-sigma of the lens coefficient around its start: keeps few points from inventing a lens."""
 

@@ -20,19 +20,19 @@ from vical_daemon.vision.target import AprilGrid
 
 BoolArray = npt.NDArray[np.bool_]
 
-MIN_RADIUS_PX = 1.6
+MIN_RADIUS_PX = 1.6  # of the window around a corner: twice the smoothing
 MIN_CONTRAST = 0.3
 """Of the board's median corner contrast: below, a corner is hidden or washed out."""
-MIN_CONTRAST_DN = 6.0
-MAX_SIGMA_PX = 2.0
-GROW_ROUNDS = 3
-MIN_AGREEMENT = 0.3
-MIN_BOARD_AGREEMENT = 0.35
+MIN_CONTRAST_DN = 6.0  # grey levels; below, noise looks like corners
+MAX_SIGMA_PX = 2.0  # of a corner; usual ones have 0.1
+GROW_ROUNDS = 3  # fits of the board's model, each to the corners that the last one found
+MIN_AGREEMENT = 0.3  # of the bits of a tag with its code, see `agreement`; below, it is hidden
+MIN_BOARD_AGREEMENT = 0.35  # mean over the tags; below, the board is not where it seems
 RETRY_PX = 0.5
 """A corner that was not found is looked for again where its prediction moved by more than this."""
 MANY_NEW = 0.1
 """Share of new corners above which the model is fitted again."""
-MIN_RIM_CORNERS = 3
+MIN_RIM_CORNERS = 3  # beyond a checkerboard's edge that look like corners, before it counts as shifted
 MAX_RIM_SHARE = 0.2
 """Of the places just beyond a checkerboard: this many that look like its corners, and it is shifted."""
 

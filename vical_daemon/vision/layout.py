@@ -13,7 +13,7 @@ from vical_daemon.vision.target import AprilGrid, Checkerboard, Target
 
 TAG_BORDER_SHARE = 0.2
 """Width of a tag's black border divided by its size: 2 of 10 modules (Kalibr)."""
-SQUARE_SHARE = 0.45
+SQUARE_SHARE = 0.45  # of a square's side that the window around its corner may reach
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from vical_daemon.vision.detection import FloatArray
 BoolArray = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
 
-RADIUS = 6
+RADIUS = 6  # px of the window around a feature
 SIZE = 2 * RADIUS + 1
-ITERATIONS = 3
+ITERATIONS = 3  # Gauss-Newton steps, from a place that is predicted to a pixel or so
 
 
 @dataclass(frozen=True)

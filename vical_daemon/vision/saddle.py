@@ -28,25 +28,25 @@ BoolArray = npt.NDArray[np.bool_]
 
 AROUND_PX = 40.0
 """Of the places a board is expected at: search, windows, and what an expectation is off by."""
-SMOOTHING_PX = 0.8
+SMOOTHING_PX = 0.8  # sigma of the Gaussian before derivatives are taken: lenses blur by about as much
 SMOOTHED_NOISE = 0.10
 """Variance of white pixel noise after the smoothing and an average bilinear look-up."""
 GRID = 32
 """`cv2.remap` looks up on a grid of 1/32 px: centres are put on it, the rest is solved for."""
-RADII = (2, 3, 4, 6)
+RADII = (2, 3, 4, 6)  # px of the windows: the largest that fits into the squares is taken
 _MARGIN_PX = np.array(RADII) + 1.0
 _KERNEL = cv2.getGaussianKernel(5, SMOOTHING_PX, cv2.CV_32F)
-SADDLE_STEPS = 4
+SADDLE_STEPS = 4  # at most, of Newton
 NEAR_PX = 0.4
 """A corner's saddle steps stop when it is this close; the symmetry steps do the rest."""
-SYMMETRY_STEPS = 2
+SYMMETRY_STEPS = 2  # likewise
 STILL_PX = 0.03
 """A symmetry step shorter than this needs no second one; the error (RMS) is unchanged to 0.2 %."""
 NOISE_SAMPLES = 8000
 """Pixels from which the noise is estimated: to about 1.5 %."""
 SIGMA_FLOOR_PX = 0.008
 """Errors that the residual does not show: edge curvature by distortion, interpolation."""
-QUANTISATION_DN = 0.35
+QUANTISATION_DN = 0.35  # grey levels: 0.29 of rounding, and of what a camera's processing adds
 
 
 @dataclass(frozen=True, slots=True)

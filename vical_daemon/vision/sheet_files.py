@@ -7,7 +7,7 @@ from xml.sax.saxutils import escape
 
 from vical_daemon.vision.board_sheet import Sheet
 
-POINTS_PER_MM = 72.0 / 25.4
+POINTS_PER_MM = 72.0 / 25.4  # of PDF
 
 
 def to_svg(sheet: Sheet) -> str:

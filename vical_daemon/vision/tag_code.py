@@ -11,12 +11,12 @@ import numpy.typing as npt
 from vical_daemon.vision.detection import FloatArray, IntArray, sample
 from vical_daemon.vision.target import TAG_FAMILY_SIZE
 
-BITS = 6
-BORDER = 2
+BITS = 6  # a side: the family 36h11
+BORDER = 2  # modules of black around them, as Kalibr prints them
 MODULES = BITS + 2 * BORDER
 MAX_WRONG_BITS = 3
 """Corrected bits; the family keeps any two words at least 11 bits apart."""
-MIN_CONTRAST_DN = 12.0
+MIN_CONTRAST_DN = 12.0  # grey levels between black and white; below, noise decides the bits
 
 
 @lru_cache(maxsize=1)

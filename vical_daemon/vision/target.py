@@ -25,9 +25,9 @@ FloatArray = npt.NDArray[np.float64]
 TAG_FAMILY_SIZE = 587
 """Number of codes in the 36h11 family: ids run from 0 to 586."""
 
-MAX_BOARD_M = 20.0
-MAX_SPACING_RATIO = 2.0
-MAX_CHECKERBOARD_CORNERS = 200
+MAX_BOARD_M = 20.0  # a wall of a hall; larger ones are in millimetres by mistake
+MAX_SPACING_RATIO = 2.0  # gaps twice as wide as the tags
+MAX_CHECKERBOARD_CORNERS = 200  # along one side
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ _TAGS_A_TURN = 4  # kinds of tags that one image is searched for
 _MAX_COLS = 30  # of boards that are tried
 _SPACINGS = np.geomspace(0.02, 2.0, 24)  # gaps over tags that are tried first
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # of a tag, in edges
+# a checkerboard of unknown counts: at least so many inner corners
 _SMALLEST, _ANY_COUNTS = (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 _GOES_ON = 0.3
 """Of the contrast of the squares: what lies around them alternates by more where a board goes on."""

@@ -19,7 +19,7 @@ from vical_daemon.vision.patches import Float32, Templates, no_templates
 
 BoolArray = npt.NDArray[np.bool_]
 
-SMOOTHING_PX = 0.8
+SMOOTHING_PX = 0.8  # as in `saddle`
 _KERNEL = cv2.getGaussianKernel(5, SMOOTHING_PX, cv2.CV_32F)
 
 
@@ -95,7 +95,7 @@ class _Features:
 
 EPIPOLAR_EVERY = 5
 """Frames between the pictures that the epipolar check compares: enough parallax, little change."""
-MIN_EPIPOLAR = 15
+MIN_EPIPOLAR = 15  # features: five decide an essential matrix, the others show outliers
 
 
 class FeatureTracker:

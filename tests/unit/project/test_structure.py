@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.structure import Sources, cycles, functions, import_edges, inline_floats, named_constants
+from benchmarks.structure import (
+    Sources,
+    cycles,
+    functions,
+    import_edges,
+    inline_floats,
+    named_constants,
+    unexplained_constants,
+)
 
 ROOT = Path(__file__).parents[3]
 
@@ -59,5 +67,17 @@ def test_a_cycle_is_found_wherever_it_is_entered():
 def test_constants_are_numbers_with_names_in_capitals():
     lines = ["A, _B = 1.0, (2, 3)", "C: float = -float(4)", "D = 'x'", "E = A", "f = 1.0", "def g(x):"]
     tree = ast.parse("\n".join([*lines, "    return 3.7 * x + 0.5 + 1e-9"]))
-    assert list(named_constants(tree)) == ["A", "_B", "C"]
+    assert [name for name, _ in named_constants(tree)] == ["A", "_B", "C"]
     assert list(inline_floats(tree)) == [3.7]
+
+
+@pytest.mark.parametrize("folder", ["vical_daemon/estimation", "vical_daemon/vision"])
+def test_each_number_with_a_name_says_what_it_is(folder):
+    """CONTRIBUTING.md: every number has a unit and a source."""
+    sources = sources_of(folder)
+    missing = [
+        f"{path}:{line} {name}"
+        for path, tree in sources.trees.items()
+        for name, line in unexplained_constants(tree, (sources.root / path).read_text())
+    ]
+    assert missing == []

@@ -17,10 +17,10 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 _POSE = 6  # degrees of freedom
-_ITERATIONS = 5
+_ITERATIONS = 5  # of the update, at most: each takes a digit or more off what is left
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)
-_RESIDUAL_GATE = chi_square_limit(2, LIKELY_SIGMAS)
+_CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of a corner before the update
+_RESIDUAL_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of what the update leaves of it
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S

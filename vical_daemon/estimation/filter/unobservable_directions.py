@@ -41,7 +41,7 @@ UNKNOWN_S = 0.3
 UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
 """Sigma of an unknown angle: all are equally likely."""
 _RECENT_S = 0.3  # of images by which an axis is seen to turn: 17 deg/s
-_HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6
+_HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6  # sigmas of what motion does not show yet: as good as known
 
 
 @dataclass(slots=True)

@@ -21,7 +21,7 @@ IDENTITY = np.eye(3)
 _NO_ANGLE = 1e-40  # rad^2: keeps sin(a)/a defined at zero, and changes no digit of it anywhere
 _SERIES_BELOW_RAD = 0.3  # below it the closed forms lose digits, and five terms of the series are exact
 
-
+# vec(hat(v)) = v _SKEW
 _SKEW = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
     dtype=np.float64,

@@ -20,7 +20,7 @@ GAP_S = 0.05
 """Between samples further apart than this nothing is known, s. A cubic over 50 ms misses a 3 Hz motion of
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
-_LEAST_HALF_S = 1e-3
+_LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
 _HALF_BLOCK_S = 2.5e-3  # of `BlockMeans`
 _USUAL = 201  # samples whose median interval is the usual one
 

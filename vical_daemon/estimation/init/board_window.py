@@ -48,7 +48,7 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mc
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
-_LEAST_IMAGES = 3
+_LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with

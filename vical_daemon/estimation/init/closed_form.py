@@ -40,7 +40,7 @@ from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
-_PARTIAL_SHIFTS_S = (-1.0, 1.0)
+_PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about
 
 
 @dataclass(frozen=True, slots=True)

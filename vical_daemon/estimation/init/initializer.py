@@ -23,7 +23,7 @@ from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.wording import not_in_view
 
-MIN_SPAN_S = 3.0
+MIN_SPAN_S = 3.0  # of images of one camera before the first attempt
 _WAIT_S = 2.0 * MIN_SPAN_S  # of images of one camera, for others that have not seen the target
 _MAX_FRAMES = 500  # of each camera
 _KEEP_S = 1.25 * LONG_S  # of images, however many they are

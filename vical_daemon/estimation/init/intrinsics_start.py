@@ -19,8 +19,8 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MOST_STEPS
 
-MOST_VIEWS = 24
-_FEWEST, _LEAST_POINTS = 6, 12
+MOST_VIEWS = 24  # spread over places, sizes and slants; the filter refines the lens
+_FEWEST, _LEAST_POINTS = 6, 12  # views, and points in each: a pose takes six numbers of each view
 _Poses = list[tuple[FloatArray, FloatArray]]
 # relative to fx for the first four; four for the distortion, and radtan's fifth
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])

@@ -30,7 +30,7 @@ from vical_daemon.estimation.model.state import (
     State,
 )
 
-_LEAST_IMAGES = 3
+_LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""

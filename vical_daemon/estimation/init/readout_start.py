@@ -19,8 +19,8 @@ from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
-_ROUNDS = 3
-_SHORT_S = 0.004
+_ROUNDS = 3  # lens and readout in turn
+_SHORT_S = 0.004  # readout that is compared with none, see `looks_rolling`
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
 
 

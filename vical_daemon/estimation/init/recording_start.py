@@ -30,7 +30,7 @@ from vical_daemon.estimation.model.priors import (
 from vical_daemon.estimation.model.state import BiasStart, MotionStart, State
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
-_LEAST_IMAGES = 8
+_LEAST_IMAGES = 8  # with poses: fewer do not show which of them are wrong
 _LEAST_S = 1.5
 """Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
 _MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now

@@ -21,7 +21,7 @@ _GRAVITY = (
     "gravity comes out as {:.2f} m/s^2 instead of {:.2f}: "
     "check the target's size in its YAML and the unit of the accelerometer"
 )
-_STRETCH_S = 10.0
+_STRETCH_S = 10.0  # of the latest poses: biases are constant over it
 _MOST_ARM_M = 0.1  # sigma of a lever arm from which a window still finds its way
 _NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
 

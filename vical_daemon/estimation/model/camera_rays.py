@@ -14,7 +14,7 @@ from vical_daemon.estimation.geometry.camera_model import (
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.robust import MOST_STEPS
 
-_PATCHES = (8, 6)
+_PATCHES = (8, 6)  # across and down: a lens is close to its linearisation within each
 _NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
 
 

@@ -13,8 +13,8 @@ from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
-ENTRIES = 15
-NUMBERS = ENTRIES + 1
+ENTRIES = 15  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
+NUMBERS = ENTRIES + 1  # and the accelerometer's lag
 
 
 def numbers_of(state: State) -> FloatArray:

@@ -10,7 +10,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import State
 
-SLOPE_S = 0.02
+SLOPE_S = 0.02  # of readings over which the slope of a rate is taken: two or more at 100 Hz
 RATE_BLOCK_S = 0.1  # over which rates are averaged before their changes are looked at
 
 

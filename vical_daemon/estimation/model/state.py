@@ -25,9 +25,9 @@ POSITION = slice(3, 6)  # m, p_world_imu
 VELOCITY = slice(6, 9)  # m/s, in world
 GYRO_BIAS = slice(9, 12)  # rad/s
 ACCEL_BIAS = slice(12, 15)  # m/s^2
-BIASES = slice(9, 15)
+BIASES = slice(9, 15)  # rad/s, then m/s^2
 GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
-CORE = 17
+CORE = 17  # numbers of these
 
 LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
 LOWER_FLAT = 3 * LOWER[:, 0] + LOWER[:, 1]  # the same among its nine numbers, row by row

@@ -16,7 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 
-MODES = 11
+MODES = 11  # narrow, skew, and nine of second order, see `fields`
 _EXPECTED = 0.002  # of half the target's larger side
 
 

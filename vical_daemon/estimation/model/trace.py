@@ -7,7 +7,7 @@ import numpy as np
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, Status, TracePoint
 from vical_daemon.estimation.significance import EVERY_S
 
-_MOST = 7200
+_MOST = 7200  # points kept: two hours at one a second, then half as many of the older half
 
 
 class Trace:

@@ -22,8 +22,8 @@ from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chance
 
 _LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
-_LEAST = 3
-_LONGEST_RUN = 4
+_LEAST = 3  # stretches: with two, one difference would stand for all scatter
+_LONGEST_RUN = 4  # stretches left out together: errors that last longer are taken as constant
 
 
 class _JackknifeBlock(NamedTuple):

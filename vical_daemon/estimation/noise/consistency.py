@@ -28,7 +28,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
 
-MODES = 8
+MODES = 8  # of an image: the degrees of freedom of a homography
 _TELLING = 30
 """Images after which a model that fits is believed to: sums over six of them are known to 20 %."""
 _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
@@ -36,15 +36,15 @@ _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
 EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
 3 s say 14, those over 1 s 8."""
 _SHARE = 0.2  # of all images, at most in one sum: the long-run variance is then known to 18 %
-_FLOOR = 0.5
-_GAIN_START, _GAIN_END = 0.1, 0.01
+_FLOOR = 0.5  # excess of the long-run variance below which sigmas stay: 1.2 times in sigma
+_GAIN_START, _GAIN_END = 0.1, 0.01  # an image's share in the scale: memory of 10, later 100 images
 _MAX_SCALE = 4.0
 """Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, the
 corners of EuRoC at 5 Hz weigh so little that neither lens nor target is found to be off."""
-_DEAD_BAND = 1.3
+_DEAD_BAND = 1.3  # of the scale: with a memory of 100 images of 8 modes, chance gives less than 1.15
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
-_CUSUM_DRIFT = 1.6
-_CUSUM_LIMIT = 9.0
+_CUSUM_DRIFT = 1.6  # of the mean square, a step an image: it is 1 where the model holds
+_CUSUM_LIMIT = 9.0  # of their sum; by chance below 1e-10 an image, see `learn`
 _MOST = 5.0  # that one image counts
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 
 _GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
-LEAST_PX, MOST_PX = 0.005, 20.0
+LEAST_PX, MOST_PX = 0.005, 20.0  # of a corner's noise: a simulation without any, a detector that guesses
 _USUAL_DOF = 30.0
 """What the usual noise weighs against that of one image: 15 corners. With 10 or 100 it matters as little."""
 

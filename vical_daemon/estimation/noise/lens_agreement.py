@@ -18,7 +18,7 @@ from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, STRETCH_S
 
 _WEAK = 0.1  # of the focal length: as good as nothing known
-_WEAK_DISTORTION = 0.5
+_WEAK_DISTORTION = 0.5  # of a coefficient: likewise
 # the two highest powers of the radius among fx fy cx cy and the distortion
 _RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
 

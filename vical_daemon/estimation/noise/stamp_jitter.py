@@ -12,7 +12,7 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
 
 FLOOR_S = 2e-5  # of a jitter that is one
-_ROUNDS = 8
+_ROUNDS = 8  # of scoring, from a start by medians
 ANNOUNCED_S = 3e-4
 """From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
 PERSISTENT = 0.5

@@ -22,7 +22,7 @@ from vical_daemon.estimation.selection.model_mixture import joined, parts
 from vical_daemon.estimation.selection.model_selection import factor, lenses_known
 
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
-_LEAST_S = 1.0
+_LEAST_S = 1.0  # of images before a drift is asked for
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:

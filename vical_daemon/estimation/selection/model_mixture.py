@@ -23,7 +23,7 @@ from vical_daemon.estimation.model.priors import OFF
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 
 _MOST = 300.0  # of a logarithm
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE = 1e-9  # probability of a hypothesis that is left out of the mixture
 
 Weights = dict[tuple[str, ...], float]
 """Probability of each hypothesis, named by the blocks that are as specified."""

@@ -35,7 +35,7 @@ _OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation bey
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
-_LEAST_LANDMARKS = 8
+_LEAST_LANDMARKS = 8  # as many as the eight-point algorithm needs
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the jitter that is allowed for: so much does not end a window

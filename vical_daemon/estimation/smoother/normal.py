@@ -28,7 +28,7 @@ from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
 
 HUBER = 2.5  # sigmas (of the two axes together)
 _CONSTANTS = 9  # the first column of them, see `_derivatives`
-_GAUGE = 1e10
+_GAUGE = 1e10  # information that holds the window's place and heading, 1/m^2 and 1/rad^2: 10 um
 _INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
 
 

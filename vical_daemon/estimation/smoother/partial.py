@@ -16,10 +16,10 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.smoother.track_start import ROUNDS, ArmPrior, NoStartError, TrackStart
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
-_STEP_RAD = float(np.deg2rad(15.0))
-_FINE_RAD = float(np.deg2rad(4.0))
-_ROUGH_ROUNDS = 4
-_APART_RAD = float(np.deg2rad(45.0))
+_STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
+_FINE_RAD = float(np.deg2rad(4.0))  # likewise about the best: the window converges from there
+_ROUGH_ROUNDS = 4  # of reweighting at each angle tried first
+_APART_RAD = float(np.deg2rad(45.0))  # from here on it is another mounting
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
 

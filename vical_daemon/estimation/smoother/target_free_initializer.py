@@ -49,10 +49,10 @@ class _Found(NamedTuple):
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
 
-_SPAN_S = 5.0
-_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
-_ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
-_SHIFT_SIGMA_S = 4e-3
+_SPAN_S = 5.0  # of images in the first attempt
+_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # likewise at least; with a calibration to begin with
+_ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))  # of the mounting from rotations: a window converges from there
+_SHIFT_SIGMA_S = 4e-3  # of the time shift: likewise, 0.2 deg at 60 deg/s
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 

@@ -26,12 +26,12 @@ from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict,
 from vical_daemon.estimation.status.steady_status import Verdict
 from vical_daemon.estimation.wording import cause_text
 
-_ENOUGH_WINDOWS = 2
-_MOST_SIGMA_PX = 3.0
-_MOST_INERTIAL = 2.5
-_MOST_REFUSED = 0.4
+_ENOUGH_WINDOWS = 2  # the first one shows only what it was fitted to
+_MOST_SIGMA_PX = 3.0  # noise of a track beyond which a window has failed; usual trackers have 0.1 to 1 px
+_MOST_INERTIAL = 2.5  # likewise, rms of the inertial residuals in their sigmas
+_MOST_REFUSED = 0.4  # likewise, share of the sightings left out: with half, either half may be right
 _LEARNING = 4  # windows
-_MOST_FACTOR = 100.0
+_MOST_FACTOR = 100.0  # of the variance: sigmas ten times too small are no scatter but a change
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 

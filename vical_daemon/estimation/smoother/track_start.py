@@ -26,8 +26,8 @@ from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
-ROUNDS = 8
-_RAY_SIGMA = 2e-3
+ROUNDS = 8  # of reweighting by the depths found and by outliers
+_RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
 
 
 class NoStartError(Exception):

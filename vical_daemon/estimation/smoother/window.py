@@ -27,9 +27,9 @@ from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
-MAX_LANDMARKS = 220
-_MIN_SEEN = 4
-NEAREST_M, FARTHEST_M = 0.1, 200.0
+MAX_LANDMARKS = 220  # the longest tracks: three times what a camera of 75 features shows at once
+_MIN_SEEN = 4  # images of a landmark: eight numbers for three unknowns, so that an outlier shows
+NEAREST_M, FARTHEST_M = 0.1, 200.0  # of a landmark at the start: rooms and streets
 
 IntArray = npt.NDArray[np.intp]
 

@@ -25,7 +25,7 @@ from vical_daemon.estimation.selection.clock_drift import apart, stamps_variance
 from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_SIGMAS
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 
-_SPAN = 20
+_SPAN = 20  # estimates that are compared, one a second
 
 
 @dataclass(slots=True)

@@ -20,13 +20,11 @@ from vical_daemon.estimation.model.rates import RATE_BLOCK_S
 from vical_daemon.estimation.temporal.rotation_turns import MIN_RATE_RPS
 from vical_daemon.estimation.wording import ALONG
 
-WIDE = ConvergenceTargets(
-    0.005, math.radians(0.5), 0.5e-3
-)  # beyond: a direction counts as not observed at all
-_SLOW_RPS = math.radians(12.0)
-_ONE_AXIS = (
-    0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis
-)
+WIDE = ConvergenceTargets(0.005, math.radians(0.5), 0.5e-3)
+"""Beyond, a direction counts as not observed at all."""
+_SLOW_RPS = math.radians(12.0)  # rms; below, guidance asks for faster turns
+_ONE_AXIS = 0.03
+"""Second over first eigenvalue of the rates' scatter, below which the rig turned about one axis."""
 _STEADY = 0.3  # change of the rate in a second over the rate, below which it turns steadily
 _NEAR = 0.5  # cosine above which turning about an axis is much the same as about a direction
 _GOOD_AXES: tuple[Axis, ...] = ("x", "y")  # any two will do; with these the target stays in view

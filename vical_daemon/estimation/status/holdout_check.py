@@ -17,11 +17,11 @@ from vical_daemon.estimation.measurements import FloatArray, MeasuredNoise, Poin
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.robust import median
 
-EVERY_S = 1.5
-_AHEAD_S = 0.3
+EVERY_S = 1.5  # between two predictions: five times their length, so that they share nothing
+_AHEAD_S = 0.3  # of a prediction: noise of the readings then exceeds that of the corners
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
-_CLIP = 10.0
+_CLIP = 10.0  # that one prediction counts
 _FITS = 2.0
 """Corner scale above which it is the images that do not fit. Where their errors last, predictions may be off
 by these, too: on EuRoC by 1.6 times. White noise that the readings show is then not in doubt."""

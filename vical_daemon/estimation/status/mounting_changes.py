@@ -12,7 +12,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.estimation.significance import chi_square_limit
 
-_SIGMAS = 4.0
+_SIGMAS = 4.0  # of what both estimates leave open
 IRRELEVANT_M, _IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 """Smaller changes are not announced, however significant: thermal play of a mount."""
 IRRELEVANT_PX = 1.0  # likewise of fx: 1 px at the edge of an image 90 deg wide

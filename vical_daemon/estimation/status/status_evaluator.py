@@ -35,7 +35,7 @@ from vical_daemon.estimation.wording import not_in_view
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
-_NIS_BAD = 4.0
+_NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
 _KEPT_CHECKS = round(3600.0 / EVERY_S)  # of an hour
 

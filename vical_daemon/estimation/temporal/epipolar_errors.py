@@ -15,7 +15,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs
 
-_MEMORIES_S = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
+_MEMORIES_S = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)  # tried: from one image at 10 Hz to the length of a track
 _BINS = 8  # of the time between two images
 
 

@@ -32,7 +32,7 @@ from vical_daemon.estimation.temporal.epipolar_errors import (
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
-_ITERATIONS = 18
+_ITERATIONS = 18  # steps, at most: five with a wide gate, five with the lens as given, then to convergence
 # What a lens may be off by: focal length and its ratio (relative), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
 _DISTORTION_SIGMA = {

@@ -28,6 +28,14 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
+__all__ = ["Fit", "OrientationSensor", "polish"]
+
+_GATE = chi_square_limit(3, PERHAPS_SIGMAS)  # of an orientation
+_ROUNDS = 12  # Gauss-Newton steps, at most; each finds again which orientations count
+_SHIFT_DONE_S = 2e-8  # a change of the shift below this ends it: a hundredth of the best sigmas
+# in which rounds the noises are estimated and with what steps, for one sensor and for several
+_SWEEPS = ({3: (0.5, 0.25), 5: (0.2,)}, {3: (0.5,), 5: (0.3,)})
+_STAMP_RATE_SIGMA = 0.1  # prior of the difference between the rates of two clocks
 _MOST_SLOW = 4.0  # logarithm of a slow error over the noise; as far below
 _CLOSE = 0.1  # a minimum this close, in steps, is reached
 
@@ -102,16 +110,6 @@ def estimate_scales(
         replace(s, log_scale=float(scales[i]), log_slow=float(scales[S + i])) for i, s in enumerate(sensors)
     )
     return sensors, float(scales[-1])
-
-
-__all__ = ["Fit", "OrientationSensor", "polish"]
-
-_GATE = chi_square_limit(3, PERHAPS_SIGMAS)
-_ROUNDS = 12
-_SHIFT_DONE_S = 2e-8
-# in which rounds the noises are estimated and with what steps, for one sensor and for several
-_SWEEPS = ({3: (0.5, 0.25), 5: (0.2,)}, {3: (0.5,), 5: (0.3,)})
-_STAMP_RATE_SIGMA = 0.1  # prior of the difference between the rates of two clocks
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
-_GRID_S = 0.01
-_FINE_S = 0.0025
-_CANDIDATES = 4
+_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s
+_FINE_S = 0.0025  # likewise about the best ones
+_CANDIDATES = 4  # shifts whose directions are compared too: periodic motion agrees in size at several
 
 
 @dataclass(frozen=True)

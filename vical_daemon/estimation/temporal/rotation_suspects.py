@@ -22,6 +22,13 @@ from vical_daemon.estimation.temporal.rotation_start import (
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, camera_turns
 
 _CLEAR = 0.25  # misfit of turns over their size below which they fit
+_AGREE = 0.6  # share of the turns that agree in size where stamps are no longer stretched
+BETTER = 0.6  # misfit over that of the data as they are
+_MOST = 0.22  # by which stamps may be stretched: 30 images a second counted as 25 are 0.2
+_STEP, _FINE = 0.02, 0.0025  # between the factors tried; likewise about the best
+_GRID_S = 0.02  # of the shifts tried with each factor
+_LONGEST_S = 12.0  # of the data looked at: with more, the factors would have to be closer
+_TURNS = 80  # enough to tell factors apart
 
 
 def explain(
@@ -80,15 +87,6 @@ def stretched(rate: float, reference: Reference) -> str:
         "rotations fit once that is taken out: look at how the stamps are made (a nominal rate, a "
         "wrong tick length?)"
     )
-
-
-_MOST = 0.22
-_STEP, _FINE = 0.02, 0.0025
-_GRID_S = 0.02
-_LONGEST_S = 12.0  # with more data the grid of stretches would have to be finer
-_TURNS = 80  # enough to tell factors apart
-_AGREE = 0.6
-BETTER = 0.6  # misfit over that of the data as they are
 
 
 def estimate_clock_rate(

@@ -20,14 +20,14 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 IntArray = npt.NDArray[np.intp]
 
 MIN_RATE_RPS = np.deg2rad(3.0)  # slower than this is "not moving"
-MIN_PAIRS = 8
+MIN_PAIRS = 8  # 24 equations for mounting, bias and delay
 # Turns are taken over the shortest of these times over which they are distinct, s: a short one is little
 # touched by outliers, by the gyro's bias and by holes; each doubling doubles the turn over the same noise.
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)
 _DISTINCT = 10.0  # ratio of a usual turn to its noise
 _ABOVE_NOISE = 3.0  # a turn this many times its noise is motion
 _LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
-_MAX_PAIRS = 300
+_MAX_PAIRS = 300  # for the start, which needs no more; the polish takes all orientations
 _LOW = 0.05  # quantile of third differences that shows their noise: outliers are above
 _SLOWEST_S = 0.11  # at less than 9 Hz third differences of a hand's motion exceed any noise
 

@@ -16,7 +16,7 @@ from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 
 _GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
-_LEAST_IMAGES = 8
+_LEAST_IMAGES = 8  # 24 equations for a world's orientation and the shift
 _STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
 _APART_S = 0.05  # other places on the curve begin so far from the best
 

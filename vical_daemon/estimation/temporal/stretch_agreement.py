@@ -16,7 +16,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
 
-_STRETCHES = 6
+_STRETCHES = 6  # at most: their scatter is then known to a third
 _LEAST_ROWS = 20  # orientations in a stretch
 
 

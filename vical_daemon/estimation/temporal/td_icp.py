@@ -55,9 +55,8 @@ __all__ = [
 ]
 
 ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
-_DOUBTFUL_RAD = float(
-    np.deg2rad(0.5)
-)  # noise of one orientation above which the usual mistakes are tried out
+_DOUBTFUL_RAD = float(np.deg2rad(0.5))
+"""Noise of one orientation above which the usual mistakes are tried out."""
 _MOST = 3000  # orientations of several sensors in all; more would add minutes and little accuracy
 
 

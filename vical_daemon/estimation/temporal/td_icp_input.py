@@ -14,7 +14,7 @@ from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 _USUAL = ImuNoise()
 USUAL_RAD = float(np.deg2rad(0.1))
 """Noise of an orientation from a board as it usually is, rad."""
-MIN_ORIENTATIONS = 12
+MIN_ORIENTATIONS = 12  # 36 equations for mounting, world, bias and delay (10)
 SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen
 
 

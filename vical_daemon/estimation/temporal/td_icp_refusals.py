@@ -16,8 +16,8 @@ from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIc
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
-_SHIFT_LOST_S = 3e-3
-_ROTATION_LOST_RAD = float(np.deg2rad(3.0))
+_SHIFT_LOST_S = 3e-3  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
+_ROTATION_LOST_RAD = float(np.deg2rad(3.0))  # likewise of a mounting, which by eye is known as well
 _UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
 

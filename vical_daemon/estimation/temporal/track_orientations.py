@@ -21,9 +21,9 @@ from vical_daemon.estimation.robust import MEDIAN_ABSOLUTE, geman_mcclure_weight
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
-_STEPS = 12
+_STEPS = 12  # Gauss-Newton steps of one pair of images
 _PLAIN_STEPS = 6  # before outliers are put aside
-_AT_ONCE = 32
+_AT_ONCE = 32  # pairs in one batch of arrays: beyond, they leave the cache
 
 Pair = tuple[FloatArray, FloatArray]
 

@@ -22,11 +22,11 @@ from vical_daemon.estimation.temporal.track_orientations import track_orientatio
 
 Lens = tuple[FloatArray, FloatArray, str]
 
-_WINDOW_S = 20.0
-_MOST_WINDOWS = 6
-_MOST_STARTS = 3
+_WINDOW_S = 20.0  # of a fit: a gyro's bias is constant over it
+_MOST_WINDOWS = 6  # two minutes in all, spread over a longer recording
+_MOST_STARTS = 3  # windows in which a start is looked for
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
-_INLIERS = 0.5
+_INLIERS = 0.5  # share of the feature pairs that must fit
 
 
 def track_registration(
