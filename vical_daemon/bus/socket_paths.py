@@ -10,7 +10,7 @@ import stat
 from enum import Enum
 from pathlib import Path
 
-from vical_daemon.config.paths import runtime_directory
+from vical_daemon.config.paths import chosen_runtime_directory, runtime_directory
 
 SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
 _TRY_S = 0.5
@@ -32,9 +32,12 @@ def own_socket() -> Path:
 def local_sockets() -> list[Path]:
     """Return where a bus may be on this computer, this user's own first.
 
-    Skips a runtime folder that another user owns: anyone can create one below /tmp.
+    A runtime folder that the environment names is the only one: a command must not reach another rig. One that
+    it does not name is skipped if another user owns it: anyone can create one below /tmp.
     """
     own = own_socket()
+    if chosen_runtime_directory() is not None:
+        return [own]
     try:
         ours = own.parent.stat().st_uid in (os.getuid(), 0)
     except OSError:
