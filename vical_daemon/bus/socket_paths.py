@@ -32,8 +32,8 @@ def own_socket() -> Path:
 def local_sockets() -> list[Path]:
     """Return where a bus may be on this computer, this user's own first.
 
-    A runtime folder that the environment names is the only one: a command must not reach another rig. One that
-    it does not name is skipped if another user owns it: anyone can create one below /tmp.
+    A runtime folder that the environment names is the only one: a command must not reach another rig. Any
+    other is skipped if another user owns it: anyone can create one below /tmp.
     """
     own = own_socket()
     if chosen_runtime_directory() is not None:
