@@ -65,11 +65,10 @@ def _level(
         return Level.WARN if first and health.state in _BEGINNING else Level.ERROR, text
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
-    dropped = f"{queue.dropped} samples dropped" if queue.dropped else ""
     if queue.drop_age_s < _RECENT_S:
         rate = f"{health.stats.rate_hz:.1f} Hz; " if health.stats.rate_hz else ""
-        return Level.WARN, f"{rate}{dropped} since the start: the bus is too slow"
+        return Level.WARN, f"{rate}{queue.dropped} samples dropped since the start: the bus is too slow"
     if health.stats.rate_hz and abs(health.stats.rate_hz / nominal_rate_hz - 1) > 0.1:
         return Level.WARN, f"{health.stats.rate_hz:.1f} Hz instead of {nominal_rate_hz:g} Hz"
-    before = f"; {dropped} before by a slow bus" if dropped else ""
+    before = f"; {queue.dropped} samples dropped before by a slow bus" if queue.dropped else ""
     return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost{before}"

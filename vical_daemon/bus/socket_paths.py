@@ -13,6 +13,8 @@ from pathlib import Path
 from vical_daemon.config.paths import chosen_runtime_directory, runtime_directory
 
 SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
+PATH_BYTES = 107
+"""Longest path of a unix socket (unix(7): 108 with the zero at its end)."""
 _TRY_S = 0.5
 
 
