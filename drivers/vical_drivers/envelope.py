@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 
 _DELAY_MEMORY = 1000
 """So many samples weigh in the mean delay."""
@@ -79,14 +80,20 @@ class LowerEnvelope:
     @property
     def window_s(self) -> float:
         """Present length of the memory, s: the cube root balances jitter/W against wander * W^2."""
-        o, delay_s = self.options, self._typical_delay_s
-        window = 1.5 * (delay_s / o.skew_wander_per_s) ** (1 / 3) if delay_s > 0 else 0.0
+        o = self.options
+        window = (
+            1.5 * (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
+        )
         return min(max(window, o.min_window_s), o.max_window_s)
 
     @property
     def _typical_delay_s(self) -> float:
-        """Median of the blocks' mean delays, s: one stall, however long, says nothing about the others."""
-        delays_s = sorted(self._block_delays_s)
+        """Median of the mean delays of the newest half of the blocks, s.
+
+        A stall shorter than a quarter of the memory does not count. Jitter that begins counts after a quarter:
+        before the slope rests on it, which is that at the middle of the memory.
+        """
+        delays_s = sorted(islice(reversed(self._block_delays_s), (len(self._block_delays_s) + 1) // 2))
         if not delays_s:
             return max(self._block_sum_s, 0.0) / max(1, self._block_points)
         return max(delays_s[len(delays_s) // 2], 0.0)
