@@ -90,7 +90,7 @@ class LowerEnvelope:
     def _typical_delay_s(self) -> float:
         """Median of the mean delays of the newest half of the blocks, s.
 
-        A stall shorter than a quarter of the memory does not count. Jitter that begins counts after a quarter:
+        A stall shorter than a quarter of the memory does not count. Jitter that begins counts from then on:
         before the slope rests on it, which is that at the middle of the memory.
         """
         delays_s = sorted(islice(reversed(self._block_delays_s), (len(self._block_delays_s) + 1) // 2))
