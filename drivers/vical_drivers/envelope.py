@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 
 _DELAY_MEMORY = 1000
 """So many samples weigh in the mean delay."""
@@ -56,6 +57,7 @@ class LowerEnvelope:
         self.options = options or EnvelopeOptions()
         self._block_s = self.options.block_s
         self._blocks: deque[tuple[float, float]] = deque()
+        self._block_delays_s: deque[float] = deque()  # the mean of each block
         self._best: tuple[float, float] | None = None
         self._best_delay_s = math.inf
         self._block_end_s = 0.0
@@ -65,6 +67,7 @@ class LowerEnvelope:
         self._delay_mean_s = 0.0
         self._delay_square_s2 = 0.0
         self._points = 0
+        self._block_points, self._block_sum_s = 0, 0.0
         self._new, self._new_sum_s, self._new_sum_s2 = 0, 0.0, 0.0  # not yet in the mean
         self.sigma_s = math.inf
         self._skew_sigma = self.options.skew_prior
@@ -82,6 +85,18 @@ class LowerEnvelope:
             1.5 * (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
         )
         return min(max(window, o.min_window_s), o.max_window_s)
+
+    @property
+    def _typical_delay_s(self) -> float:
+        """Median of the mean delays of the newest half of the blocks, s.
+
+        A stall shorter than a quarter of the memory does not count. Jitter that begins counts from then on:
+        before the slope rests on it, which is that at the middle of the memory.
+        """
+        delays_s = sorted(islice(reversed(self._block_delays_s), (len(self._block_delays_s) + 1) // 2))
+        if not delays_s:
+            return max(self._block_sum_s, 0.0) / max(1, self._block_points)
+        return max(delays_s[len(delays_s) // 2], 0.0)
 
     def line(self, x_s: float) -> float:
         """Offset (host - device) at device time `x_s`, s."""
@@ -123,15 +138,19 @@ class LowerEnvelope:
             gain = count / max(count, min(self._points, _DELAY_MEMORY))
             self._delay_mean_s += gain * (self._new_sum_s / count - self._delay_mean_s)
             self._delay_square_s2 += gain * (self._new_sum_s2 / count - self._delay_square_s2)
+            self._block_points += count
+            self._block_sum_s += self._new_sum_s
             self._new, self._new_sum_s, self._new_sum_s2 = 0, 0.0, 0.0
 
     def _close_block(self) -> None:
         assert self._best is not None
         self._blocks.append(self._best)
-        self._best = None
+        self._block_delays_s.append(self._block_sum_s / max(1, self._block_points))
+        self._best, self._block_points, self._block_sum_s = None, 0, 0.0
         oldest = self._newest_s - self.window_s
         while len(self._blocks) > 2 and self._blocks[0][0] < oldest:
             self._blocks.popleft()
+            self._block_delays_s.popleft()
 
     def _fit(self) -> None:
         points = list(self._blocks)
@@ -155,14 +174,14 @@ class LowerEnvelope:
         """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
         residuals = sorted(d - self.line(x) for x, d in points)
         # A few points may agree by chance: their number bounds what can be believed.
-        believable_s = self._delay_mean_s / math.sqrt(max(1, self._points))
+        believable_s = self._typical_delay_s / math.sqrt(max(1, self._points))
         return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
 
     def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
         memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
         lead_s = memory_s / 3.0
         if len(points) < 5:
-            spread_s = max(spread_s, self._delay_mean_s)
+            spread_s = max(spread_s, self._typical_delay_s)
         wander_s = 0.5 * self.options.skew_wander_per_s * lead_s**2
         return math.hypot(spread_s, self._skew_sigma * lead_s, wander_s)
 

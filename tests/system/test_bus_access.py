@@ -139,11 +139,22 @@ def test_readers_loopback_lets_everybody_watch_and_nobody_command(service, tmp_p
     bus.close()
 
 
+def own_runtime_folder(monkeypatch, session):
+    """The user's folder below that of the login session; nothing else names one."""
+    for variable in ("VICAL_RUNTIME_DIR", "RUNTIME_DIRECTORY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
+    own = session / "vical"
+    if session.exists():
+        own.mkdir()
+    return own
+
+
 def test_a_folder_that_is_closed_to_us_is_one_line(service, monkeypatch):
     if os.geteuid() == 0:
         pytest.skip("nothing is closed to root")
     monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", service)
-    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(service.parent.parent / "nothing"))
+    own_runtime_folder(monkeypatch, service.parent.parent / "nothing")
     service.parent.chmod(0)
     assert reach(service) is Reach.CLOSED
     with pytest.raises(BusError, match="who alone may use it") as error:
@@ -175,18 +186,27 @@ def test_the_line_names_user_or_group(tmp_path, monkeypatch):
 
 def test_nobody_there_is_said_with_every_place(tmp_path, monkeypatch):
     monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", tmp_path / "service.sock")
-    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path))
+    own = own_runtime_folder(monkeypatch, tmp_path)
     with pytest.raises(BusError, match=r"nothing answers; start `vical run") as error:
         open_local_bus(tcp_port=free_port())
     assert str(tmp_path / "service.sock") in str(error.value)
-    assert str(tmp_path / "zenoh.sock") in str(error.value)
+    assert str(own / "zenoh.sock") in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_runtime_folder_that_the_user_names_is_the_only_one(service, tmp_path, monkeypatch):
+    # a command that is meant for another rig must not reach the service
+    monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", service)
+    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path / "mine"))
+    with pytest.raises(BusError, match="nothing answers") as error:
+        open_local_bus(tcp_port=0)
+    assert f"no bus at {tmp_path / 'mine' / 'zenoh.sock'}: " in str(error.value)
 
 
 def test_clients_find_the_service_without_being_told(service, tmp_path, monkeypatch):
     monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", service)
-    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "zenoh.sock").touch()  # left behind by a router of this user that was killed
+    own = own_runtime_folder(monkeypatch, tmp_path)
+    (own / "zenoh.sock").touch()  # left behind by a router of this user that was killed
     with client.connect() as robot:
         assert robot.latest() == []
     config = tmp_path / "vical.yaml"
@@ -195,14 +215,14 @@ def test_clients_find_the_service_without_being_told(service, tmp_path, monkeypa
 
 
 def test_a_folder_that_somebody_else_made_in_our_place_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path))
-    assert local_sockets()[0] == tmp_path / "zenoh.sock"
+    own = own_runtime_folder(monkeypatch, tmp_path)
+    assert local_sockets()[0] == own / "zenoh.sock"
     stat = Path.stat
 
     class Foreign:
         st_uid = 12345
 
-    monkeypatch.setattr(Path, "stat", lambda self, **k: Foreign if self == tmp_path else stat(self, **k))
+    monkeypatch.setattr(Path, "stat", lambda self, **k: Foreign if self == own else stat(self, **k))
     assert local_sockets() == [socket_paths.SERVICE_SOCKET]
 
 

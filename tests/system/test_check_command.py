@@ -48,6 +48,20 @@ def test_json_lists_every_problem(rig, capsys) -> None:
     assert [c["what"] for c in result["checked"] if c["problem"]] == ["target", "imus.imu0", "cameras.cam0"]
 
 
+def test_what_cannot_be_written_hosted_or_verified_is_found(rig, tmp_path, capsys) -> None:
+    (tmp_path / "file").write_text("")
+    more = (
+        f"store: {{directory: {tmp_path}/file}}\nmode: verify\nverify: {{against: nothing.json}}\n"
+        f"cameras: {{cam0: {{uri: 'v4l2:/dev/video77'}}}}\n"
+        f"bus: {{socket: '{tmp_path}/{'x' * 120}', connect: [robot]}}\n"
+    )
+    assert main(["check", "-c", rig("/dev/nothing", more), "--no-devices", "--json"]) == 1
+    problems = json.loads(capsys.readouterr().out)["problems"]
+    assert len(problems) == 4
+    for part in ("file is no folder", "nothing.json", "107 bytes at most", "'robot' is no endpoint"):
+        assert any(part in problem for problem in problems), part
+
+
 def test_a_wrong_config_exits_2_with_all_of_it(rig, capsys) -> None:
     config = rig("/dev/x", "rat: 5\nweb: {prt: 1}\n")
     assert main(["check", "-c", config, "--no-devices"]) == 2

@@ -9,6 +9,8 @@ from vical_daemon.bus.messages import DiagnosticStatus, Level
 
 STUCK_S = 5.0
 """A device loop that has not turned for this long, s, is stuck: STALE, and systemd restarts the process."""
+_RECENT_S = 10.0
+"""Samples dropped so recently, s, are a problem of now: the status comes once a second."""
 _BEGINNING = {"opening": "is being opened", "silent": "open, no data yet"}
 """States without a problem so far, in words."""
 
@@ -63,9 +65,10 @@ def _level(
         return Level.WARN if first and health.state in _BEGINNING else Level.ERROR, text
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
-    if queue.dropped:
+    if queue.drop_age_s < _RECENT_S:
         rate = f"{health.stats.rate_hz:.1f} Hz; " if health.stats.rate_hz else ""
-        return Level.WARN, f"{rate}{queue.dropped} samples dropped: the bus is too slow (since the start)"
+        return Level.WARN, f"{rate}{queue.dropped} samples dropped since the start: the bus is too slow"
     if health.stats.rate_hz and abs(health.stats.rate_hz / nominal_rate_hz - 1) > 0.1:
         return Level.WARN, f"{health.stats.rate_hz:.1f} Hz instead of {nominal_rate_hz:g} Hz"
-    return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost"
+    before = f"; {queue.dropped} samples dropped before by a slow bus" if queue.dropped else ""
+    return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost{before}"

@@ -52,6 +52,7 @@ class DirectQueue(CountingPublisher):
             with suppress(IndexError):  # the publishing thread was faster
                 self._queue.popleft()
                 self._overflowed += 1
+                self._dropped_s = time.monotonic()
         self._queue.append((key, payload))
 
     def flush(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,15 @@ from vical_drivers.closing import Closing
 from vical_drivers.errors import DataEndedError, DeviceLostError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 
-from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_imu
+from vical_daemon.bus.messages import (
+    MessageError,
+    admit_stamp_sigma_s,
+    decode_compressed_image,
+    decode_diagnostics,
+    decode_image,
+    decode_imu,
+)
+from vical_daemon.bus.topics import STATUS
 from vical_daemon.config.model import LOG_SCHEME
 from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
@@ -41,20 +50,21 @@ class _Playback:
         self._t_start_ns: int | None = None
         self._lock = threading.Lock()
 
-    def items(self, stream: Stream) -> Iterator[tuple[int, bytes]]:
-        """Yield (stamp on CLOCK_MONOTONIC in ns, message) of a stream.
+    def items(self, stream: Stream) -> Iterator[tuple[int, str, bytes]]:
+        """Yield (stamp on CLOCK_MONOTONIC in ns, key, message) of a stream, and of the status of its role.
 
         A later call joins at the present position of the recording.
         """
+        also = [STATUS.key(self.recording.rig, "imu")] if stream.kind == "imu" else []
         now_ns = time.monotonic_ns()
         with self._lock:
             if self._t_start_ns is None:
                 self._t_start_ns = now_ns
             offset_ns = self._t_start_ns - self._begin_ns
-        for _, payload in self.recording.messages([stream]):
+        for key, payload in self.recording.messages([stream], also):
             stamp_ns = stamp_of(payload)
             if stamp_ns is not None and stamp_ns + offset_ns >= now_ns:
-                yield stamp_ns + offset_ns, payload
+                yield stamp_ns + offset_ns, key, payload
 
 
 class _LogDevice(Closing):
@@ -83,8 +93,8 @@ class _LogDevice(Closing):
             details={"rate_hz": f"{self._stream.rate_hz:.3f}", "topic": self._stream.source},
         )
         self._statistics = FrameStatistics()
-        self._items: Iterator[tuple[int, bytes]] | None = None
-        self._next: tuple[int, bytes] | None = None
+        self._items: Iterator[tuple[int, str, bytes]] | None = None
+        self._next: tuple[int, str, bytes] | None = None
 
     def _due(self, end_ns: int) -> tuple[int, bytes] | None:
         """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message.
@@ -97,7 +107,7 @@ class _LogDevice(Closing):
             self._items = self._playback.items(self._stream)
         if self._next is None:
             try:
-                self._next = next(self._items)
+                self._next = self._next_of_stream(self._items)
             except RecordingError as error:
                 self._items = None  # the next read starts again
                 raise DeviceLostError(str(error)) from None
@@ -107,13 +117,22 @@ class _LogDevice(Closing):
                     f"{recording.path} has ended after {recording.duration_s:.1f} s; start again to replay it"
                 )
                 raise DataEndedError(ended) from None
-        t_host_ns, payload = self._next
+        t_host_ns, _, payload = self._next
         _sleep_until(min(t_host_ns, end_ns))
         if t_host_ns > end_ns:
             return None
         self._next = None
         self._statistics.add(t_host_ns, 0)
         return t_host_ns, payload
+
+    def _next_of_stream(self, items: Iterator[tuple[int, str, bytes]]) -> tuple[int, str, bytes]:
+        """Return the next message of the stream; statuses before it are noted."""
+        while (item := next(items))[1] != self._stream.key:
+            self._note_status(item[2])
+        return item
+
+    def _note_status(self, payload: bytes) -> None:
+        """Take what the role of the device said of it when this was recorded."""
 
     def stats(self) -> SourceStats:
         """Counters since it was opened."""
@@ -125,10 +144,18 @@ class _LogDevice(Closing):
 
 
 class LogImu(_LogDevice):
-    """An `ImuSource`: the inertial samples of a recording."""
+    """An `ImuSource`: the inertial samples of a recording, known to what the driver said of its stamps."""
 
     def __init__(self, uri: str) -> None:
         super().__init__(uri, _IMU_KINDS, "imu")
+        self._sigma_ns = 0
+
+    def _note_status(self, payload: bytes) -> None:
+        with suppress(MessageError):
+            for status in decode_diagnostics(payload).statuses:
+                said_us = status.values.get("stamp_sigma_us")
+                if status.name == f"imu/{self._stream.name}" and said_us is not None:
+                    self._sigma_ns = round(1e9 * admit_stamp_sigma_s(said_us))
 
     def read(self, timeout_s: float) -> list[ImuSample]:
         """See `ImuSource.read`."""
@@ -152,7 +179,12 @@ class LogImu(_LogDevice):
                 continue
             samples.append(
                 ImuSample(
-                    t_host_ns, end_ns, message.stamp_ns // 1000, message.gyro_rps, message.specific_force_mps2
+                    t_host_ns,
+                    end_ns,
+                    message.stamp_ns // 1000,
+                    message.gyro_rps,
+                    message.specific_force_mps2,
+                    t_sigma_ns=self._sigma_ns,
                 )
             )
         return samples

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
@@ -18,11 +20,17 @@ class CountingPublisher:
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self._overflowed = self._refused = self._published = 0
+        self._dropped_s = -math.inf
 
     @property
     def dropped(self) -> int:
         """Messages that did not fit into the queue, or that the bus refused."""
         return self._overflowed + self._refused
+
+    @property
+    def drop_age_s(self) -> float:
+        """Time since the last message that was dropped, s; infinite: none was."""
+        return time.monotonic() - self._dropped_s
 
     @property
     def published(self) -> int:
@@ -35,6 +43,7 @@ class CountingPublisher:
             self._published += 1
         except Exception:  # a broken link must not end acquisition; the bus reconnects by itself
             self._refused += 1
+            self._dropped_s = time.monotonic()
             _log.exception("cannot publish on %s", key)
 
 
@@ -74,6 +83,7 @@ class PublishQueue(CountingPublisher):
                 self._queue.put(None)  # `close` was called meanwhile: keep its mark
             else:
                 self._overflowed += 1
+                self._dropped_s = time.monotonic()
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Publish what waits, then stop. Gives up after `timeout_s`. May be called twice."""

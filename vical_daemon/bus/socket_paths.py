@@ -10,9 +10,11 @@ import stat
 from enum import Enum
 from pathlib import Path
 
-from vical_daemon.config.paths import runtime_directory
+from vical_daemon.config.paths import chosen_runtime_directory, runtime_directory
 
 SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
+PATH_BYTES = 107
+"""Longest path of a unix socket (unix(7): 108 with the zero at its end)."""
 _TRY_S = 0.5
 
 
@@ -32,9 +34,12 @@ def own_socket() -> Path:
 def local_sockets() -> list[Path]:
     """Return where a bus may be on this computer, this user's own first.
 
-    Skips a runtime folder that another user owns: anyone can create one below /tmp.
+    A runtime folder that the environment names is the only one: a command must not reach another rig. Any
+    other is skipped if another user owns it: anyone can create one below /tmp.
     """
     own = own_socket()
+    if chosen_runtime_directory() is not None:
+        return [own]
     try:
         ours = own.parent.stat().st_uid in (os.getuid(), 0)
     except OSError:

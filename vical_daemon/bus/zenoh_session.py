@@ -165,7 +165,9 @@ def free_socket(path: Path) -> None:
             path.unlink()
         return
     except OSError as error:
-        raise BusError(f"{path}: {error.strerror}; set bus.socket to a path that this user may use") from None
+        raise BusError(
+            f"{path}: {error.strerror or error}; set bus.socket to a path that this user may use"
+        ) from None
     finally:
         probe.close()
     raise BusError(

@@ -178,7 +178,8 @@ class CalibrationPersistence:
         text = event_text(event)
         notify.event(name, text, level=level, rig=self._config.rig, **fields)
         if event.kind not in _LOGGED and "JOURNAL_STREAM" not in os.environ:
-            _log.warning("%s", text)  # a terminal does not show the journal
+            number = logging.INFO if level == "notice" else logging.WARNING
+            _log.log(number, "%s", text)  # a terminal does not show the journal
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store an estimate if it has converged."""

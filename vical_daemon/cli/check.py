@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -89,6 +90,8 @@ def examine(config: Config, name: str, *, devices: bool) -> Iterator[Finding]:
     yield Finding("config", f"{name}: {_summary(config)}")
     yield from _check_target(config)
     yield _check_disk(config)
+    yield from _check_store(config)
+    yield from _check_bus(config)
     if not devices:
         return
     from vical_daemon.acquire.camera import open_camera
@@ -125,7 +128,9 @@ def _check_disk(config: Config) -> Finding:
     from vical_daemon.config.paths import state_directory
 
     folder = Path(config.record.directory or state_directory() / "log")
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    existing, problem = _folder(folder)
+    if problem:
+        return Finding("record", str(folder), problem)
     try:
         free = shutil.disk_usage(existing).free
     except OSError as error:
@@ -137,6 +142,55 @@ def _check_disk(config: Config) -> Finding:
             "record", text, f"{text}, below record.reserve_bytes ({reserve:.1f} GB): nothing is recorded"
         )
     return Finding("record", text)
+
+
+def _folder(folder: Path) -> tuple[Path, str]:
+    """Return the nearest folder that exists, and why nothing can be written there ("": nothing is known).
+
+    Rights are not looked at: the service may run as another user.
+    """
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if not existing.is_dir():
+        return existing, f"{existing} is no folder; choose another directory"
+    if os.statvfs(existing).f_flag & os.ST_RDONLY:
+        return existing, f"{existing} is on a read-only file system; choose another directory"
+    return existing, ""
+
+
+def _check_store(config: Config) -> Iterator[Finding]:
+    from vical_daemon.config.paths import state_directory
+    from vical_daemon.results.export import ExportError
+    from vical_daemon.results.files import read_known_file
+
+    folder = Path(config.store.directory or state_directory() / "calibration")
+    yield Finding("store", str(folder), _folder(folder)[1])
+    if config.mode != "verify" or config.verify_path is None:
+        return
+    try:
+        known, _ = read_known_file(config.verify_path)
+    except ExportError as error:
+        yield Finding("verify.against", str(config.verify_path), str(error))
+        return
+    yield Finding("verify.against", f"{config.verify_path}: {', '.join(known)}")
+
+
+def _check_bus(config: Config) -> Iterator[Finding]:
+    """Find what keeps the bus from being hosted; nothing is opened."""
+    from vical_daemon.bus.socket_paths import PATH_BYTES
+    from vical_daemon.bus.zenoh_session import ENDPOINT
+    from vical_daemon.cli.bus_access import socket_path
+
+    path = socket_path(config.bus)
+    if path.is_dir():
+        yield Finding("bus", str(path), f"bus.socket: {path} is a folder; give the name of a socket in it")
+    elif len(os.fsencode(path)) > PATH_BYTES:
+        shorter = f"a socket's path has {PATH_BYTES} bytes at most; set bus.socket or VICAL_RUNTIME_DIR"
+        yield Finding("bus", str(path), f"{path}: {shorter}")
+    for key, endpoints in (("listen", config.bus.listen), ("connect", config.bus.connect)):
+        for endpoint in endpoints:
+            if not ENDPOINT.fullmatch(endpoint):
+                problem = f"bus.{key}: {endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447"
+                yield Finding("bus", endpoint, problem)
 
 
 def _check_imu(what: str, imu: ImuConfig, open_source: Callable[[ImuConfig], ImuSource]) -> Finding:

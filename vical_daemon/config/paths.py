@@ -12,11 +12,17 @@ LOOPBACK_PORT = 7447
 
 def runtime_directory() -> Path:
     """Return the folder for sockets and files until the next boot (``/run/vical`` as a service)."""
-    given = os.environ.get("VICAL_RUNTIME_DIR") or _first("RUNTIME_DIRECTORY")
-    if given:
-        return Path(given)
+    given = chosen_runtime_directory()
+    if given is not None:
+        return given
     session = os.environ.get("XDG_RUNTIME_DIR")
     return Path(session) / "vical" if session else Path(tempfile.gettempdir()) / f"vical-{os.getuid()}"
+
+
+def chosen_runtime_directory() -> Path | None:
+    """Return the runtime folder that the environment names; None: it names none."""
+    given = os.environ.get("VICAL_RUNTIME_DIR") or _first("RUNTIME_DIRECTORY")
+    return Path(given) if given else None
 
 
 def state_directory() -> Path:

@@ -169,6 +169,8 @@ def _convert_mapping(node: yaml.MappingNode, path: str, document: Document) -> d
 def _convert_scalar(node: yaml.Node, path: str, document: Document) -> Value:
     text = str(node.value)
     quoted = getattr(node, "style", None) in ("'", '"', "|", ">")
+    if "\0" in text:  # no path, no name
+        raise ConfigError(f"{path}: a zero byte is not accepted ({document.where(path)})")
     if quoted:
         return text
     at = f"({document.where(path)})"

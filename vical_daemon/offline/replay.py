@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from vical_daemon.bus.interface import Bus
-from vical_daemon.bus.topics import check_name
+from vical_daemon.bus.topics import STATUS, check_name
 from vical_daemon.logs import Recording
 from vical_daemon.logs.recorded_logs import stamp_of
 
@@ -24,7 +24,7 @@ def replay(
     everything: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, float]:
-    """Publish a recording; stamps stay as recorded.
+    """Publish a recording; stamps stay as recorded. What the imu's driver said of its stamps comes with them.
 
     Args:
         recording: What to publish.
@@ -41,7 +41,8 @@ def replay(
     prefix = f"vical/{check_name(rig)}/" if rig else ""
     begin_s, count, late_s, shown_s = time.monotonic(), 0, 0.0, 0.0
     first_ns = recording.begin_ns
-    for key, payload in recording.messages(recording.streams if everything else None):
+    streams, also = recording.streams if everything else None, [STATUS.key(recording.rig, "imu")]
+    for key, payload in recording.messages(streams, also):
         data_s = ((stamp_of(payload) or first_ns) - first_ns) * 1e-9
         wait_s = begin_s + data_s / speed - time.monotonic() if speed else 0.0
         if wait_s > 0:

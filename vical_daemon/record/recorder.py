@@ -43,7 +43,7 @@ class Recorder:
     def __init__(self, config: Config, folder: LogFolder, clock: WallClock) -> None:
         self._config, self._folder, self._clock = config, folder, clock
         self._images = ImageCompressor(config)
-        self._wanted = config.record.enabled
+        self._wanted, self._why_off = config.record.enabled, "off: record.enabled is false"
         self._session: LogSession | None = None
         self._problem = ""
         self._retry_ns = 0
@@ -132,7 +132,7 @@ class Recorder:
             self.tick()
         elif word == "stop":
             _log.info("recording stopped by command")
-            self._wanted = False
+            self._wanted, self._why_off = False, "stopped by command"
             self.close()
         elif word == "split" and self._session is not None:
             self._split()
@@ -278,7 +278,10 @@ class Recorder:
             pass  # the folder is missing: `problem` reports it
         if self._problem:
             return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
-        message = f"recording, {self.messages} messages" if session else "stopped by command"
+        if session is None:
+            message = "not recording" if self._wanted else self._why_off
+            return DiagnosticStatus(Level.OK, "record", message, values=values)
+        message = f"recording, {self.messages} messages"
         if queue.dropped or lost:
             message = f"{message}; {values['dropped']} dropped, {lost} lost since the start"
             return DiagnosticStatus(Level.WARN, "record", message, values=values)

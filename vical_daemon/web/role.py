@@ -136,7 +136,9 @@ async def _serve(
         await server.close()
         code = error.errno or 0  # positive codes are the kernel's, whose text is shorter than asyncio's
         reason = os.strerror(code) if code > 0 else error.strerror or str(error)
-        raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
+        raise WebError(
+            f"cannot serve the page on {host}:{port}: {reason}; set web.host or web.port"
+        ) from error
     address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     _log.info("page at %s", address)
     if ready is not None:

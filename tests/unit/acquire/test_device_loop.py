@@ -223,7 +223,9 @@ def test_a_stuck_driver_makes_the_status_stale(stop) -> None:
     queue.close()
 
 
-def test_publish_queue_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
+def test_publish_queue_keeps_order_and_drops_the_oldest_when_the_bus_is_slow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     bus, gate, got = LocalBus(), threading.Event(), []
 
     def slow(sample) -> None:
@@ -241,6 +243,10 @@ def test_publish_queue_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -
     gate.set()
     queue.close()
     assert got == [b"0", b"3", b"4", b"5"] and queue.published == 4
+    later_s = time.monotonic() + 60.0
+    monkeypatch.setattr(time, "monotonic", lambda: later_s)  # the bus has recovered
+    level, text = _level(_streaming(), queue, 100.0)
+    assert level is Level.OK and "2 samples dropped before" in text
 
 
 def test_a_bus_that_raises_does_not_end_acquisition() -> None:

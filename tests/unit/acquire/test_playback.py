@@ -13,7 +13,14 @@ from vical_drivers.samples import FrameSource, ImuSource
 
 from vical_daemon.acquire.camera import open_camera
 from vical_daemon.acquire.imu import open_imu
-from vical_daemon.bus.messages import encode_image, encode_imu, encode_points
+from vical_daemon.bus.messages import (
+    DiagnosticStatus,
+    Level,
+    encode_diagnostics,
+    encode_image,
+    encode_imu,
+    encode_points,
+)
 from vical_daemon.config.model import CameraConfig, ImuConfig
 from vical_daemon.logs.mcap import LogWriter
 
@@ -66,6 +73,22 @@ def test_imu_and_camera_share_the_recorded_time_base(log: Path) -> None:
     begin_ns = stamps[0] - first * IMU_STEP_NS
     assert frame.t_exposure_mid_ns - begin_ns == FIRST_FRAME_NS + number * FRAME_STEP_NS
     assert all(s.t_arrival_ns >= s.t_host_ns for s in samples)
+
+
+def test_stamps_are_known_as_when_they_were_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    said = DiagnosticStatus(Level.OK, "imu/imu0", values={"stamp_sigma_us": "150.0"})
+    with LogWriter(path) as writer:
+        for k in range(8):
+            t_ns = T0_NS + k * IMU_STEP_NS
+            payload = encode_imu(t_ns, "imu0", (0.1 * k, 0.0, 0.0), (0.0, 0.0, 9.8))
+            writer.write("vical/rig0/imu/imu0", payload, t_ns)
+            if k == 3:
+                status = encode_diagnostics(t_ns + 1, "imu", [said])
+                writer.write("vical/rig0/status/imu", status, t_ns + 1)
+    with open_imu(ImuConfig(port=f"log:{path}")) as imu:
+        samples = _samples(imu, 8)
+    assert [s.t_sigma_ns for s in samples] == [0] * 4 + [150_000] * 4
 
 
 def test_it_is_played_once_and_its_end_is_told(log: Path) -> None:

@@ -141,6 +141,7 @@ def test_scientific_notation_is_the_number_it_means() -> None:
     ("text", "part"),
     [
         ("a: &x [1]\nb: *x", "aliases"),
+        ('a: "x\\0y"', "a: a zero byte"),
         ("- 1\n- 2", "expected `key: value` lines"),
         ("a: [1", "not valid YAML"),
         ("a: !!python/object/apply:os.system [true]", "expected"),

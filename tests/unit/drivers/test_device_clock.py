@@ -50,6 +50,38 @@ def test_stamps_find_the_true_instants_behind_one_sided_jitter(skew_ppm, rate_hz
     assert clock.lost == clock.outliers == clock.restarts == 0
 
 
+@pytest.mark.parametrize("rate_hz", [100.0, 500.0])
+def test_a_computer_that_stalled_for_seconds_knows_the_stamps_as_before(rate_hz):
+    ticks, true_s, arrival_ns = arrivals(int(40 * rate_hz), rate_hz, 25.0, usb)
+    stalled = (true_s > 120.0) & (true_s < 124.0)
+    arrival_ns[stalled] = np.maximum(arrival_ns[stalled], 124_000_000_000)
+    stamps = run(DeviceClock(TICK_HZ, rate_hz=rate_hz), ticks, np.maximum.accumulate(arrival_ns))
+    error_s = np.array([s.t_device_event_ns for s in stamps]) * 1e-9 - true_s
+    sigma_s = np.array([s.t_sigma_ns for s in stamps]) * 1e-9
+    assert sigma_s[true_s > 124.0].max() < 2.0 * sigma_s[(true_s > 115.0) & (true_s < 120.0)].max()
+    assert np.abs(error_s / sigma_s)[true_s > 115.0].max() < 4.0
+
+
+def begins(rng, n):
+    """Jitter of 10 ms begins after 30 of 60 s."""
+    return np.where(np.arange(n) < n // 2, rng.exponential(1e-4, n), rng.exponential(1e-2, n))
+
+
+def passes(rng, n):
+    """A computer that is hardly responsive for 10 s in the middle."""
+    k = np.arange(n) / n * 60.0
+    return rng.exponential(1e-4, n) + np.where((k > 25.0) & (k < 35.0), rng.exponential(0.3, n), 0.0)
+
+
+@pytest.mark.parametrize("delay_s", [begins, passes])
+def test_sigmas_stay_honest_where_jitter_begins_and_ends(delay_s):
+    ticks, true_s, arrival_ns = arrivals(6000, 100.0, 40.0, delay_s)
+    stamps = run(DeviceClock(TICK_HZ, rate_hz=100.0), ticks, arrival_ns)
+    error_s = np.array([s.t_device_event_ns for s in stamps]) * 1e-9 - true_s
+    sigma_s = np.array([s.t_sigma_ns for s in stamps]) * 1e-9
+    assert np.abs(error_s / sigma_s)[true_s > 105.0].max() < 1.0
+
+
 def test_stamps_always_increase():
     ticks, _, arrival_ns = arrivals(2000, 1000.0, 300.0, lambda r, n: r.exponential(3e-3, n))
     stamps = [s.t_device_event_ns for s in run(DeviceClock(TICK_HZ, rate_hz=1000.0), ticks, arrival_ns)]

@@ -150,6 +150,8 @@ def test_start_and_stop_over_the_bus(make, tmp_path):
     recorder.tick()
     feed(recorder, 10)
     assert not recorder.recording
+    status = recorder.status(RecordQueue(), 6)  # what is lost while nothing is recorded is no loss
+    assert (status.level, status.message) == (m.Level.OK, "off: record.enabled is false")
     command(recorder, "start")
     assert recorder.recording
     feed(recorder, 10, 10)

@@ -94,7 +94,7 @@ class SensorIntake:
 
     def imu_news(self) -> list[Event]:
         """What happened to the readings since the last call."""
-        return self._imu.news()
+        return self._imu.news(self.stamp_sigma_s)
 
     def image_news(self) -> list[Event]:
         """What happened to the images since the last call."""

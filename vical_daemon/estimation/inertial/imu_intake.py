@@ -270,9 +270,13 @@ class ImuIntake:
         self._newest_s = -np.inf if self.buffer is None else self.buffer.newest_s
         self._held, self._repeated_ns, self.between = None, None, True
 
-    def news(self) -> list[Event]:
-        """What happened to the stream since the last call; a gap after an image, or half a second."""
+    def news(self, stated_s: float = 0.0) -> list[Event]:
+        """What happened to the stream since the last call; a gap after an image, or half a second.
+
+        Args:
+            stated_s: How well the driver says that it knows the device's clock, one sigma, s.
+        """
         if self._newest_s > self.gap_end_s + _UNSEEN_S:
             self._believe_gap()
-        news, self._news = self._news + self._steps.news(), []
+        news, self._news = self._news + self._steps.news(stated_s), []
         return news

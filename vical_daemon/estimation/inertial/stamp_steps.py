@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 LEARN = 20  # readings by which the usual interval is known, and how well the motion is predicted
 _LEAST_S = 1e-4  # smaller steps are like jitter
@@ -38,7 +39,7 @@ class StampSteps:
     _largest_s: float = 0.0
     _before_s: float = 0.0  # the total before a step that is not certain yet
     _since: int = 0
-    _news: list[Event] = field(default_factory=list)
+    _untold_s: float = 0.0  # steps that are certain, and were not announced
 
     def even(self, t_s: float) -> float:
         """Put the stamp of the next reading, s, on the even axis."""
@@ -79,9 +80,18 @@ class StampSteps:
         if abs(step_s) < _LEAST_S:
             self.total_s = self._before_s
             return
-        self._news.append(Event(EventKind.IMU_CLOCK_REMAPPED, value=step_s))
+        self._untold_s += step_s
 
-    def news(self) -> list[Event]:
-        """Steps that have become certain since the last call."""
-        news, self._news = self._news, []
-        return news
+    def news(self, stated_s: float = 0.0) -> list[Event]:
+        """Steps that have become certain, together, once they exceed what the driver states of its stamps.
+
+        Within that a mapping moves all the time, as arrivals jitter.
+
+        Args:
+            stated_s: One sigma of the mapping as the driver states it, s; 0: it states nothing.
+        """
+        step_s = self._untold_s
+        if not step_s or abs(step_s) < SURE_SIGMAS * stated_s:
+            return []
+        self._untold_s = 0.0
+        return [Event(EventKind.IMU_CLOCK_REMAPPED, value=step_s)]

@@ -47,6 +47,20 @@ def test_a_step_that_a_driver_spreads_over_readings_is_one():
     assert len(steps.news()) == 1
 
 
+def test_steps_within_what_the_driver_states_of_its_stamps_are_no_news():
+    # a mapping that is known to 0.1 ms moves to and fro as arrivals jitter; then it moves one way
+    even = np.arange(4000) * 0.01
+    moved, told, steps = even.copy(), [], StampSteps()
+    for k, step_s in enumerate([3e-4, -2e-4, -3e-4, 2e-4, 3.5e-4, 3.5e-4, 3.5e-4]):
+        moved[400 * k + 200 :] += step_s
+    for t_s in moved:
+        steps.even(float(t_s))
+        told += steps.news(1e-4)
+    (event,) = told
+    assert event.value == pytest.approx(7e-4, abs=1e-7)
+    assert steps.total_s == pytest.approx(10.5e-4, abs=1e-7)  # the time shift follows each of them
+
+
 def test_a_single_late_stamp_is_put_right_and_leaves_nothing_behind():
     even = np.arange(400) * 0.01
     late = even.copy()
