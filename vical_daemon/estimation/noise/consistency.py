@@ -170,7 +170,7 @@ class Consistency:
         """
         if self.suspicion > 0.5 * _CUSUM_LIMIT * self.strictness:
             return True
-        return float(self._sum @ self._sum) > _LIMIT * self.factor * len(self._recent)
+        return float(self._sum @ self._sum) > _LIMIT * self.strictness * len(self._recent)
 
     @property
     def strictness(self) -> float:
