@@ -26,7 +26,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 MODES = 8  # of an image: the degrees of freedom of a homography
 _TELLING = 30
@@ -46,6 +46,7 @@ _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6  # of the mean square, a step an image: it is 1 where the model holds
 _CUSUM_LIMIT = 9.0  # of their sum; by chance below 1e-10 an image, see `learn`
 _MOST = 5.0  # that one image counts
+_LIMIT = chi_square_limit(MODES, LIKELY_SIGMAS)
 
 
 def modes(uv: FloatArray) -> FloatArray:
@@ -162,8 +163,14 @@ class Consistency:
 
     @property
     def suspicious(self) -> bool:
-        """The innovations may have jumped: half the limit of `alarmed`, with refused images counted, too."""
-        return self.suspicion > 0.5 * _CUSUM_LIMIT * self.strictness
+        """The innovations may have jumped: half the limit of `alarmed`, with refused images counted, too.
+
+        Or they lie to one side: their sum over 3 s is larger than errors that last make it on this rig. Small
+        jumps move many images by less than their noise.
+        """
+        if self.suspicion > 0.5 * _CUSUM_LIMIT * self.strictness:
+            return True
+        return float(self._sum @ self._sum) > _LIMIT * self.strictness * len(self._recent)
 
     @property
     def strictness(self) -> float:

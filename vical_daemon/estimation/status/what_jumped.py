@@ -29,12 +29,13 @@ from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, VEL
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 
 _SHIFT_S = 5e-3
-"""One sigma of a step of the time shift, s; orientations of single images show those of 3 ms and more."""
+"""One sigma of the largest step of the time shift, s (smaller ones: `jump_scores.SIZES`); orientations of
+single images show those of 3 ms and more."""
 _TURN_RAD, _MOVE_M = np.radians(5.0), 0.05
-"""One sigma of a jump of a mounting, or of the target, rad and m. Turns four times as large and
+"""Likewise of a mounting, or of the target, rad and m. Turns four times as large and
 moves twice as large are followed, too."""
 _ZOOM, _SHIFTED = 0.02, 0.01
-"""One sigma of a jump of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused
+"""Likewise of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused
 from far to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
 
 _ODDS = 20.0
@@ -47,30 +48,43 @@ Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
 class Part(Enum):
-    """What may jump: a mounting, all of them each by itself or all alike (IMU), the target, other parts."""
+    """What may jump: a mounting, all of them each by itself or all alike (IMU), the target, other parts.
+
+    KNOCK: a mounting and the time shift of its camera.
+    """
 
     NONE = auto()
     SHIFT = auto()
     DRIFT = auto()
     MOUNTING = auto()
+    KNOCK = auto()
     MOUNTINGS = auto()
     IMU = auto()
     LENS = auto()
     TARGET = auto()
 
 
-MOVED = frozenset({Part.MOUNTING, Part.MOUNTINGS, Part.IMU})
+MOVED = frozenset({Part.MOUNTING, Part.KNOCK, Part.MOUNTINGS, Part.IMU})
 """What is announced as a bump."""
+_NOT_BESIDE = (
+    (Part.KNOCK, {Part.SHIFT, Part.IMU}),
+    (Part.MOUNTING, {Part.KNOCK}),  # a special case: how far the time shift stepped, if at all, is left open
+    (Part.MOUNTINGS, {Part.MOUNTING, Part.KNOCK, Part.IMU}),
+)
+"""Parts that are not considered where one of others is possible, in this order."""
 
 
 def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
-    """Parts that may jump: directions of the errors, each as long as one sigma of the jump, shape (n, q)."""
+    """Parts that may jump: directions of the errors, each as long as one sigma of the jump, shape (n, q).
+
+    Those of a knock are the time shift's and, next to them, the mounting's.
+    """
     layout, out = f.layout, {}
     where, every = layout.cameras[camera], range(layout.size)
-    if where.timeshift is not None:
-        out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [_SHIFT_S])
     if where.skew is not None:
         out[Part.DRIFT] = _columns(layout.size, [where.skew], [SKEW_SIGMA])
+    if where.timeshift is not None:
+        out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [_SHIFT_S])
     mountings = {
         name: [*every[c.rotation], *every[c.position]]
         for name, c in layout.cameras.items()
@@ -165,25 +179,25 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
             filters[k] = deepcopy(f)
         for part in parts:
             after = _follow_after(filters[k], {part: 1.0}, images[k:], camera, step)
-            jump = _Jump(likelihood + after.likelihood, k, after.sizes)
+            total = likelihood + after.likelihood + after.jumped.any_size
+            jump = _Jump(total, k, after.jumped.sizes)
             if jump.likelihood > found.get(part, _Jump(none)).likelihood:
                 found[part] = jump
         likelihood += _follow(f, image, step)[0]
     if not found:
         return Found(Part.NONE, frozenset(), before, before)
-    best = max(found, key=lambda part: found[part].likelihood)
-    total, k, _ = found[best]
-    possible = {part for part, other in found.items() if other.likelihood > total - odds}
-    if possible & {Part.MOUNTING, Part.IMU}:  # which are special cases of it
-        possible.discard(Part.MOUNTINGS)
+    total = max(jump.likelihood for jump in found.values())
+    possible = {part for part, jump in found.items() if jump.likelihood > total - odds}
+    for part, others in _NOT_BESIDE:
+        if possible & others:
+            possible.discard(part)
+    best = max(possible, key=lambda part: found[part].likelihood)
+    k = found[best].at
     if total > none + odds and possible == {Part.TARGET}:
         return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k], k)
     if total > none + odds:
         unknown = {part: found[part].sizes for part in possible}
         after = _follow_after(filters[k], unknown, images[k:], camera, step)
-        if possible <= MOVED and Part.SHIFT in instants:
-            both = _follow_after(filters[k], {**unknown, Part.SHIFT: 1.0}, images[k:], camera, step)
-            after = both if both.likelihood > after.likelihood + odds else after
         for consistency in after.filter.consistency.values():
             consistency.settle()
         if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
@@ -197,7 +211,7 @@ def _most(used: Sequence[bool]) -> bool:
 
 
 class _Jump(NamedTuple):
-    """A jump just before an image: log-likelihood of all images, which image, and `_After.sizes`."""
+    """A jump just before an image: log-likelihood of all images, which image, and by how much."""
 
     likelihood: float
     at: int = -1
@@ -211,13 +225,13 @@ class _After(NamedTuple):
         filter: It.
         likelihood: Logarithm of the likelihood of the images.
         used: Which of them it used.
-        sizes: By how much these parts jumped: root of the expected square, over one sigma, shape (q,).
+        jumped: By how much these parts jumped.
     """
 
     filter: CalibrationFilter
     likelihood: float
     used: Sequence[bool]
-    sizes: FloatArray
+    jumped: JumpSizes
 
 
 def _follow_after(
@@ -237,6 +251,8 @@ def _follow_after(
         step: Takes an image with a filter.
     """
     f, jumps = deepcopy(before), _jumps(before, camera)
+    if Part.KNOCK in parts:
+        jumps[Part.KNOCK] = np.concatenate([jumps[Part.SHIFT], jumps[Part.MOUNTING]], axis=1)
     columns = np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1)
     f.inflate_covariance(columns)
     f.jumped = jumped = JumpSizes.of(columns)
@@ -249,7 +265,7 @@ def _follow_after(
             f.layout = replace(f.layout, held=held)
     likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
     f.jumped = None
-    return _After(f, sum(likelihoods), used, jumped.sizes)
+    return _After(f, sum(likelihoods), used, jumped)
 
 
 def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
@@ -287,6 +303,8 @@ def _suspects(
             refused.append(k)
     ends = np.cumsum([x.shape[1] for x in jumps.values()])
     own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps.items(), ends, strict=True)}
+    if Part.SHIFT in own and Part.MOUNTING in own:
+        own[Part.KNOCK] = slice(own[Part.SHIFT].start, own[Part.MOUNTING].stop)
     ratios = {part: scores.log_ratios(of) for part, of in own.items()}
     if fits and max(x.max() for x in ratios.values()) < odds:
         return likelihood, refused, {}

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
-from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
+from vical_daemon.estimation.filter.jump_scores import SIZES, JumpScores, JumpSizes
 
 IMAGES, SIGMA = 12, np.array([0.7, 0.4])
 
@@ -21,7 +22,7 @@ def problem():
     return F, images
 
 
-def run(F, images, jump_at=None):
+def run(F, images, jump_at=None, size=1.0):
     """Log-likelihood, and the scores where no jump is known."""
     S = 0.5 * np.eye(12)
     mean, total = np.zeros(12), 0.0
@@ -32,7 +33,7 @@ def run(F, images, jump_at=None):
     for k, (ways, by_error, z) in enumerate(images):
         if k == jump_at:
             P = P.copy()
-            P[[9, 11], [9, 11]] += SIGMA**2
+            P[[9, 11], [9, 11]] += (size * SIGMA) ** 2
         H = ways @ by_error
         V = np.eye(5) + H @ P @ H.T
         r = z - H @ mean
@@ -52,17 +53,17 @@ def test_ratios_are_those_of_filters_that_know_of_the_jump(problem):
     F, images = problem
     without, scores = run(F, images)
     ratios = scores.log_ratios(slice(0, 2))
-    expected = [run(F, images, k)[0] - without for k in range(IMAGES)]
-    assert ratios == pytest.approx(expected, abs=1e-9)
+    each = [[run(F, images, k, size)[0] - without for size in SIZES] for k in range(IMAGES)]
+    assert ratios == pytest.approx(logsumexp(each, axis=1) - np.log(len(SIZES)), abs=1e-9)
 
 
-def test_sizes_are_those_of_a_filter_that_estimates_the_jump(problem):
-    F, images = problem
+def estimated(F, images, size):
+    """Log-likelihood, mean square of the jump, and what `JumpSizes` say, with a jump of `size` at first."""
     columns = np.zeros((12, 2))
-    columns[[9, 11], [0, 1]] = SIGMA
+    columns[[9, 11], [0, 1]] = SIGMA * size
     P = 0.25 * np.eye(12) + columns @ columns.T
     joint = np.block([[P, columns], [columns.T, np.eye(2)]])  # of the state after the jump, and the jump
-    mean = np.zeros(14)
+    mean, total = np.zeros(14), 0.0
     jumped = JumpSizes.of(columns)
     motion = np.eye(14)
     motion[:12, :12] = F
@@ -70,12 +71,22 @@ def test_sizes_are_those_of_a_filter_that_estimates_the_jump(problem):
         L = np.linalg.cholesky(joint[:12, :12])
         H = np.concatenate([ways @ by_error, np.zeros((5, 2))], axis=1)
         r = z - H @ mean
-        K = joint @ H.T @ np.linalg.inv(np.eye(5) + H @ joint @ H.T)
+        V = np.eye(5) + H @ joint @ H.T
+        total -= 0.5 * (r @ np.linalg.solve(V, r) + np.linalg.slogdet(V)[1])
+        K = joint @ H.T @ np.linalg.inv(V)
         mean, joint = mean + K @ r, joint - K @ H @ joint
         dx, after = (K @ r)[:12], np.linalg.cholesky(joint[:12, :12])
         jumped.correct(L, after, dx)
         L = after
         jumped.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
         mean, joint = motion @ mean, motion @ joint @ motion.T
-    expected = np.sqrt(mean[12:] ** 2 + np.diag(joint)[12:])
-    assert jumped.sizes == pytest.approx(expected, abs=1e-9)
+    return total, size**2 * (mean[12:] ** 2 + np.diag(joint)[12:]), jumped
+
+
+def test_sizes_are_those_of_filters_that_estimate_the_jump(problem):
+    each = [estimated(*problem, size) for size in SIZES]
+    totals, squares = np.array([x[0] for x in each]), np.array([x[1] for x in each])
+    jumped = each[0][2]
+    assert jumped.any_size == pytest.approx(logsumexp(totals) - np.log(len(SIZES)) - totals[0], abs=1e-9)
+    expected = np.exp(totals - logsumexp(totals)) @ squares
+    assert jumped.sizes == pytest.approx(np.sqrt(expected), abs=1e-9)

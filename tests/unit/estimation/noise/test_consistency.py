@@ -137,6 +137,20 @@ def test_most_small_changes_are_an_alarm_within_two_seconds():
     assert np.median(delays) <= 40
 
 
+def test_errors_to_one_side_are_suspicious_within_three_seconds_however_small():
+    """A tenth of the noise of the corners, which no single image shows."""
+    c, rng = Consistency(), np.random.default_rng(5)
+    for _ in range(60):
+        feed(c, rng, 10)
+        assert not c.suspicious
+    noticed = []
+    for _ in range(60):
+        feed(c, rng, 1, common=np.full((1, 8), 0.1 * 0.5))
+        noticed.append(c.suspicious)
+    assert any(noticed)
+    assert c.suspicion < 2.0
+
+
 def test_chance_is_no_alarm():
     """Chernoff: exp(-h limit) with E exp(h (ratio - drift)) = 1, ratio of eight degrees of freedom."""
     h = brentq(lambda h: -4.0 * np.log(1.0 - h / 4.0) - h * consistency._CUSUM_DRIFT, 0.1, 3.99)

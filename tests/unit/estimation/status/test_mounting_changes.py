@@ -135,12 +135,28 @@ def test_a_move_along_no_axis_is_a_move() -> None:
         assert [e.kind for e in differences("cam0", before, now, 8.0, Cause.BUMPED)] == kinds
 
 
-def test_a_camera_that_is_knocked_may_be_late_as_well() -> None:
-    """With a mounting alone unknown, the time shift was found after 5 s, and errors were 4.9 sigma."""
-    rig = reference_rig(32, bumps=(Bump(AT_S, TURN_RAD, MOVE_M, 5e-3),))
-    run = simulate(32, AT_S + 5.0, rig=rig)
-    prior = camera_prior(run, 32, StartErrors(), exact_lens=True)
-    record = feed(run, CalibratorSubject(CalibrationOptions(imu_noise=imu_noise(run)), prior, run.points_m))
-    assert EventKind.BUMPED in {event.kind for _, event in record.events}
-    for answer in (s for s in record.snapshots if s.t_s > AT_S + 2.0):
-        assert np.abs(answer.error[:7] / np.sqrt(np.diag(answer.covariance))[:7]).max() < 3.5
+@pytest.mark.parametrize(("seed", "step_s"), [(31, 5e-3), (33, -2e-3)])
+def test_a_camera_that_is_knocked_may_be_late_as_well(seed, step_s) -> None:
+    """With one cause alone unknown, the target or the mounting was blamed first: 16 and 3.6 sigma."""
+    rig = reference_rig(seed, bumps=(Bump(AT_S, TURN_RAD, MOVE_M, step_s),))
+    found, worst = followed(seed, simulate(seed, AT_S + 4.0, rig=rig), AT_S + 1.0)
+    assert found == [EventKind.BUMPED]
+    assert worst < 3.0
+
+
+def test_a_small_move_is_noticed() -> None:
+    """Of 0.1 deg and 1 mm: unnoticed, it was 5.8 sigma off."""
+    rig = reference_rig(32, bumps=(Bump(AT_S, (0.0, 0.0012, -0.0012), (0.0, 0.001, 0.0)),))
+    found, worst = followed(32, simulate(32, AT_S + 4.5, rig=rig), AT_S + 3.5)
+    assert not CHANGES & set(found)  # too small to be announced
+    assert worst < 3.0
+
+
+def followed(seed: int, run: SimulatedRun, from_s: float) -> tuple[list[EventKind], float]:
+    """What is announced, and the largest error from a time on, in sigmas."""
+    prior = camera_prior(run, seed, StartErrors(), exact_lens=True)
+    subject = CalibratorSubject(CalibrationOptions(imu_noise=imu_noise(run)), prior, run.points_m)
+    record = feed(run, subject, every_s=0.5)
+    answers = [s for s in record.snapshots if s.t_s > from_s]
+    worst = max(float(np.abs(s.error[:7] / np.sqrt(np.diag(s.covariance))[:7]).max()) for s in answers)
+    return [event.kind for _, event in record.events], worst
