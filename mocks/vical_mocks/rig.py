@@ -18,6 +18,7 @@ from vical_mocks.rotations import FloatArray, exp_so3, quaternion_wxyz
 from vical_mocks.trajectory import Trajectory, hand_motion
 
 STANDARD_GRAVITY_MPS2 = 9.80665
+_DERIVATIVE_S = 1e-4  # of rates, by central differences
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class Rig:
         densities: White noise and bias walks of the imu.
         gyro_bias, accel_bias: rad/s and m/s^2.
         gyro_matrix, accel_matrix: Scale and misalignment: reading = matrix @ truth + bias + noise.
+        accel_positions: Of the accelerometer's axes x, y, z in the imu frame, m, shape (3, 3).
         bumps: Knocks, in order of time.
     """
 
@@ -137,6 +139,7 @@ class Rig:
     accel_bias: BiasWalk = field(default_factory=lambda: BiasWalk(np.zeros(3), 0.0, 0))
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_positions: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     bumps: tuple[Bump, ...] = ()
 
     def row_share(self, uv_px: FloatArray) -> FloatArray:
@@ -198,8 +201,21 @@ class Rig:
     def imu_reading(self, t_s: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """What the sensors would show without white noise: scale, misalignment and biases included."""
         rate, force = self.imu_motion(t_s)
+        if self.accel_positions.any():
+            force = force + self._size_effect(t_s, rate)
         gyro = rate @ self.gyro_matrix.T + self.gyro_bias.value(t_s)
         return gyro, force @ self.accel_matrix.T + self.accel_bias.value(t_s)
+
+    def _size_effect(self, t_s: npt.ArrayLike, rate: FloatArray) -> FloatArray:
+        """What each axis measures for its distance from the origin, m/s^2, shape (..., 3)."""
+        t = np.asarray(t_s)
+        before, after = (self.trajectory.omega_imu_rps(t + d) for d in (-_DERIVATIVE_S, _DERIVATIVE_S))
+        turning = (after - before) / (2.0 * _DERIVATIVE_S)
+        axes = [
+            (np.cross(turning, r) + np.cross(rate, np.cross(rate, r)))[..., i]
+            for i, r in enumerate(self.accel_positions)
+        ]
+        return np.stack(axes, axis=-1)
 
     # --- for people and reports -----------------------------------------------------------------------
     def truth(self, t_s: float = 0.0, camera: str = "cam0") -> dict[str, Any]:

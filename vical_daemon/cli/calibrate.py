@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vical_daemon.offline.calibration_job import Job
 
 FIX = ("intrinsics", "timeshift", "extrinsics")
-ESTIMATE = ("imu_intrinsics", "readout", "target_scale", "target_shape")
+ESTIMATE = ("imu_intrinsics", "size_effect", "readout", "target_scale", "target_shape")
 _EXAMPLES = """\
 examples:
   vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics
@@ -65,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "--estimate",
         metavar="WHAT",
         default="",
-        help="comma-separated, estimated from the start, not only if the data require it: "
-        + ", ".join(ESTIMATE),
+        help="comma-separated, estimated from the start, not only if the data require it (size_effect, the "
+        "positions of the accelerometer's axes: only if asked for): " + ", ".join(ESTIMATE),
     )
     add_stretch(parser)
     parser.add_argument(

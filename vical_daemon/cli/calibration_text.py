@@ -23,6 +23,8 @@ def describe(result: dict[str, Any]) -> str:
         for key, label in (("gyro_matrix", "gyro matrix"), ("accel_matrix", "accel. matrix")):
             for axis, row in zip("xyz", imu.get(key) or [], strict=False):
                 lines.append(_row(f"{label} {axis}", row, None, "", 5))
+        for axis, row in zip("xyz", imu.get("accel_positions_m") or [], strict=False):
+            lines.append(_row(f"accel. axis {axis} at", [1e3 * r for r in row], None, "mm", 1))
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
     if result.get("inputs") and "disagreeing" not in result:  # `vical merge` has its own lines
         lines += ["", "recordings"]

@@ -161,7 +161,9 @@ class CalibrationConfig:
     imu: Name | None = None
     cameras: tuple[Name, ...] = ()
     fix: tuple[Literal["intrinsics", "timeshift", "extrinsics"], ...] = ()
-    estimate: tuple[Literal["imu_intrinsics", "readout", "target_scale", "target_shape"], ...] = ()
+    estimate: tuple[
+        Literal["imu_intrinsics", "size_effect", "readout", "target_scale", "target_shape"], ...
+    ] = ()
     corner_sigma_px: Annotated[float, Bound(above=0, high=20)] = CalibrationOptions().corner_sigma_px
     gravity_mps2: Annotated[float, Bound(*GRAVITY_BOUNDS, hint="magnitude on Earth, m/s^2")] = 9.80665
     lag_s: Annotated[float, Bound(low=0, high=5)] = 0.2

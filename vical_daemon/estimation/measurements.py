@@ -122,8 +122,8 @@ class CalibrationOptions:
 
     Attributes:
         fix: Of {"intrinsics", "timeshift", "extrinsics"}: held at their priors.
-        estimate: Of {"imu_intrinsics", "readout", "target_scale", "target_shape", "accel_lag"}: optional
-            blocks that are switched on.
+        estimate: Of {"imu_intrinsics", "size_effect", "readout", "target_scale", "target_shape",
+            "accel_lag"}: optional blocks that are switched on.
         target_free: Landmarks are estimated, no target is known.
         target_alike: A half turn maps the target onto itself, and its ids do not tell which end is up.
         gravity_mps2: Magnitude of gravity, m/s^2.

@@ -90,7 +90,10 @@ class CameraEstimate:
 
 @dataclass(frozen=True, slots=True)
 class ImuEstimate:
-    """Inertial biases and, where estimated, scale and misalignment, in the imu frame."""
+    """Inertial biases and, where estimated, scale and misalignment, in the imu frame.
+
+    `accel_positions_m`: of the accelerometer's axes x, y, z, where asked for; not on the bus.
+    """
 
     gyro_bias_rps: list[float]
     accel_bias_mps2: list[float]
@@ -98,6 +101,7 @@ class ImuEstimate:
     accel_bias_sigma_mps2: list[float] = field(default_factory=list)
     gyro_matrix: list[list[float]] = field(default_factory=list)
     accel_matrix: list[list[float]] = field(default_factory=list)
+    accel_positions_m: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,12 @@ from vical_daemon.estimation.inertial.imu_model import (
     Strapdown,
     compose,
     influence,
+    size_effect,
     strapdown,
 )
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model import unscented
-from vical_daemon.estimation.model.imu_scale import by_entries
+from vical_daemon.estimation.model.imu_scale import by_apart, by_entries
 from vical_daemon.estimation.model.retract import motion_points
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
@@ -65,6 +66,7 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
         points.gyro_matrix,
         points.accel_matrix,
         points.accel_lag_s,
+        points.accel_positions,
     )
     end = compose(Motion(points.R, points.p, points.v), relative, points.gravity)
     values = np.concatenate(
@@ -102,7 +104,8 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     entries = layout.gyro_matrix is not None and layout.accel_matrix is not None
     M_g, M_a = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
     lag_s = None if layout.accel_lag is None else np.array([state.accel_lag_s])
-    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], M_g, M_a, lag_s)
+    positions_m = None if layout.accel_positions is None else state.accel_positions[None]
+    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], M_g, M_a, lag_s, positions_m)
     T = float(relative.t_s[-1])
     dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
     R, g = state.R_world_imu, state.gravity
@@ -115,6 +118,11 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         readings = np.concatenate([segment.gyro - state.gyro_bias, segment.accel - state.accel_bias], axis=1)
         by = by_entries(errors, readings, state.gyro_matrix, state.accel_matrix)
         F[:, BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
+    if layout.accel_positions is not None and segment.gyro_slope is not None:
+        rate, slope = segment.gyro - state.gyro_bias, segment.gyro_slope
+        F[:, layout.accel_positions] = by_apart(
+            errors, size_effect(rate @ state.gyro_matrix.T, slope @ state.gyro_matrix.T)
+        )
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
     return Propagated(

@@ -78,4 +78,5 @@ def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
         np.concatenate([state.gyro_bias, state.accel_bias]),
         np.concatenate([sigma[GYRO_BIAS], sigma[ACCEL_BIAS]]),
         (state.gyro_matrix, state.accel_matrix) if matrices else (),
+        None if f.layout.accel_positions is None else state.accel_positions,
     )

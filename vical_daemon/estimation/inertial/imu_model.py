@@ -60,6 +60,7 @@ def strapdown(
     gyro_matrix: FloatArray | None = None,
     accel_matrix: FloatArray | None = None,
     accel_lag_s: FloatArray | None = None,
+    accel_positions: FloatArray | None = None,
 ) -> Strapdown:
     """Integrate a segment for a batch of biases (strapdown mechanisation in the start frame).
 
@@ -72,6 +73,7 @@ def strapdown(
         gyro_matrix: Scale and misalignment M_g, shape (S, 3, 3); None: identity.
         accel_matrix: The same for the accelerometer.
         accel_lag_s: How late its readings are, s, shape (S,); None: not.
+        accel_positions: Of its axes x, y, z, m, shape (S, 3, 3); None: all at the origin.
 
     Returns:
         The relative motion at every node.
@@ -88,6 +90,9 @@ def strapdown(
     turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
     if turn_slope is not None and gyro_matrix is not None:
         turn_slope = turn_slope @ gyro_matrix[0].T
+    if accel_positions is not None and turn_slope is not None:
+        # hardly depends on the bias: the first of the batch stands for all
+        force = force - np.einsum("nij,sij->sni", size_effect(omega[0], turn_slope), accel_positions)
     dR = products(rotation_steps(omega, dt, turn_slope))
     f_start = np.matvec(dR, force)
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
@@ -106,6 +111,19 @@ def strapdown(
     np.add.accumulate(gained, axis=1, out=dv[:, 1:])
     np.add.accumulate(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.clipping_sigma)
+
+
+def size_effect(rate: FloatArray, slope: FloatArray) -> FloatArray:
+    """What an accelerometer away from the origin measures besides the force there: hat(alpha) + hat(omega)^2.
+
+    Row i times the position of axis i, m, is what that axis adds, m/s^2. Shape (n, 3, 3).
+
+    Args:
+        rate: rad/s, shape (n, 3).
+        slope: Its derivative, rad/s^2, shape (n, 3).
+    """
+    hats = so3.hat(rate)
+    return so3.hat(slope) + hats @ hats
 
 
 def products(steps: FloatArray) -> FloatArray:

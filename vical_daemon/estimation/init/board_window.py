@@ -32,7 +32,7 @@ from vical_daemon.estimation.measurements import (
     IntArray,
     PointsFrame,
 )
-from vical_daemon.estimation.model.imu_scale import numbers_of
+from vical_daemon.estimation.model.imu_scale import APART, numbers_of
 from vical_daemon.estimation.model.inertial_links import (
     DONE,
     RELINK_S,
@@ -345,8 +345,10 @@ class BoardWindow:
         full[:, :, BIASES] = J[:, :, 18:24]
         if layout.gyro_matrix is not None and layout.accel_matrix is not None:
             full[:, :, layout.gyro_matrix.start : layout.accel_matrix.stop] = J[:, :, 24:39]
+        if layout.accel_positions is not None:
+            full[:, :, layout.accel_positions] = J[:, :, 24:][:, :, APART]
         if layout.accel_lag is not None:
-            full[:, :, layout.accel_lag] = J[:, :, 39]
+            full[:, :, layout.accel_lag] = J[:, :, -1]
         return e, np.concatenate([J[:, :, :18], full[:, :, MOTION.stop :]], axis=2)
 
     def normal(
@@ -462,7 +464,7 @@ def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: Im
 
 
 def _numbers(s: State) -> FloatArray:
-    """[biases, entries of the imu's matrices, lag] as links take them, shape (22,)."""
+    """[biases, entries of the imu's matrices, lag] as links take them, shape (28,)."""
     return np.concatenate([s.gyro_bias, s.accel_bias, numbers_of(s)])
 
 
@@ -473,4 +475,5 @@ def _integrated(
     t_s = np.array([n.at.t_s for n in nodes])
     if (np.diff(t_s) < 0.5 * _TOGETHER_S).any():
         return None
-    return make_links(buffer, t_s, np.broadcast_to(_numbers(state), (len(nodes) - 1, 22)), noise)
+    numbers = _numbers(state)
+    return make_links(buffer, t_s, np.broadcast_to(numbers, (len(nodes) - 1, len(numbers))), noise)

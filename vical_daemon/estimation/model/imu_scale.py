@@ -1,8 +1,12 @@
-"""Scale and misalignment of an IMU as fifteen numbers, and the lag of its accelerometer as the sixteenth.
+"""How an IMU differs from an ideal one, as numbers: matrices, positions of the accelerometer's axes, lag.
 
 omega = M_g (omega_m - b_g), f = M_a (f_m - b_a). Of M_a only the lower triangle: a full matrix could be
 traded against the mounting of the camera. Entries are those of M_g - I, row by row, and of M_a - I.
-The lag, s, is by how much the accelerometer is later than the gyro.
+An axis of the accelerometer at r measures alpha x r + omega x (omega x r) besides the force at the origin
+("size effect") [Rehder et al., "Extending kalibr", 2016]. The origin is the mean of the three positions: what
+they have in common could be traded against the lever arm of the camera.
+These positions are estimated only where they are asked for. The lag, s, is the last number: by how much the
+accelerometer is later than the gyro.
 """
 
 from __future__ import annotations
@@ -14,22 +18,53 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
 ENTRIES = 15  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
-NUMBERS = ENTRIES + 1  # and the accelerometer's lag
+APART = slice(ENTRIES, -1)  # m, positions of the accelerometer's axes; none where they are not estimated
+_POSITIONS = 6
+# Positions of three axes whose mean is zero, by two vectors; orthonormal, so that no axis is special.
+_SPREAD = np.array([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]) / np.sqrt([2.0, 6.0])
+
+
+def count(*, size_effect: bool) -> int:
+    """How many there are, with positions of the accelerometer's axes or without."""
+    return ENTRIES + _POSITIONS * size_effect + 1
 
 
 def numbers_of(state: State) -> FloatArray:
-    """Those of a state, shape (16,)."""
+    """Those of a state, with positions, shape (22,)."""
     gyro, accel = state.gyro_matrix - np.eye(3), state.accel_matrix - np.eye(3)
-    return np.concatenate([gyro.ravel(), accel[LOWER[:, 0], LOWER[:, 1]], [state.accel_lag_s]])
+    entries = gyro.ravel(), accel[LOWER[:, 0], LOWER[:, 1]]
+    return np.concatenate([*entries, apart_of(state.accel_positions), [state.accel_lag_s]])
+
+
+def apart_of(positions: FloatArray) -> FloatArray:
+    """The six numbers of the positions of axes x, y, z, m, shape (3, 3), without what they have in common."""
+    return np.asarray((_SPREAD.T @ positions).ravel())
+
+
+def positions_m(apart: FloatArray) -> FloatArray:
+    """Positions of axes x, y, z, m, shape (..., 3, 3), of their six numbers (..., 6)."""
+    return np.asarray(_SPREAD @ apart.reshape(*apart.shape[:-1], 2, 3))
 
 
 def matrices(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """M_g and M_a (..., 3, 3) of their entries (..., 15), which the lag may follow; identity without any."""
+    """M_g and M_a (..., 3, 3) of their entries (..., 15), which others may follow; identity without any."""
     gyro, accel = (np.zeros((*numbers.shape[:-1], 3, 3)) + np.eye(3) for _ in range(2))
     if numbers.shape[-1]:
         gyro += numbers[..., :9].reshape(gyro.shape)
         accel[..., LOWER[:, 0], LOWER[:, 1]] += numbers[..., 9:ENTRIES]
     return gyro, accel
+
+
+def by_apart(errors: Influence, felt: FloatArray) -> FloatArray:
+    """Derivatives of the end of a segment by the six numbers of the positions, shape (9, 6).
+
+    Args:
+        errors: What errors of rate and force do to the end.
+        felt: `size_effect` at each reading, shape (n + 1, 3, 3).
+    """
+    weighted = errors.weights[:, None, None] * errors.at[:, :, 3:6]
+    by_position = -np.einsum("nei,nij->eij", weighted, felt)
+    return np.asarray(np.einsum("eij,ia->eaj", by_position, _SPREAD).reshape(9, 6), dtype=np.float64)
 
 
 def by_entries(

@@ -12,9 +12,9 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
+from vical_daemon.estimation.inertial.imu_model import over_intervals, size_effect, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
-from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
+from vical_daemon.estimation.model.imu_scale import APART, by_apart, by_entries, matrices, positions_m
 
 _MAX_HOLE_S = 0.1  # between readings; a window bridges twice what the filter does: it would have to restart
 RELINK_S = 3e-4  # of change of the time shift: links are integrated again between the new instants
@@ -32,7 +32,7 @@ def make_links(
         buffer: Readings.
         t_s: Instants in order, at least two, s, shape (m + 1,).
         imu: Of each link [gyro, accel] bias, rad/s and m/s^2; with the numbers of `imu_scale` where they are
-            estimated; shape (m, 6) or (m, 22).
+            estimated; shape (m, 6), (m, 22) or (m, 28).
         noise: Densities.
 
     Returns:
@@ -45,15 +45,19 @@ def make_links(
     counts = np.diff(np.append(begin, len(segment.t_s)))
     of = np.repeat(np.arange(len(imu)), counts)
     M_g, M_a = matrices(imu[:, 6:])
-    lag = imu[of, 6 + ENTRIES :]
+    numbers = imu[of, 6:]
     rate, force = segment.gyro - imu[of, :3], segment.accel - imu[of, 3:6]
     turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
     assert turn_slope is not None
     assert force_slope is not None
-    if lag.size:
-        as_read = np.concatenate([rate, force], axis=1)
+    felt = np.zeros((0, 3, 3))
+    if numbers.size:
+        as_read, lag_s = np.concatenate([rate, force], axis=1), numbers[:, -1:]
         rate, turn_slope = (np.matvec(M_g[of], x) for x in (rate, turn_slope))
-        force, force_slope = (np.matvec(M_a[of], x) for x in (force + lag * force_slope, force_slope))
+        force, force_slope = (np.matvec(M_a[of], x) for x in (force + lag_s * force_slope, force_slope))
+        if numbers[:, APART].size:
+            felt = size_effect(rate, turn_slope)
+            force -= np.einsum("nij,nij->ni", felt, positions_m(numbers[:, APART]))
     zero = np.zeros((1, 3))
     even = segment._replace(gyro=rate, accel=force, gyro_slope=turn_slope, accel_slope=force_slope)
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
@@ -63,9 +67,15 @@ def make_links(
     except np.linalg.LinAlgError:
         return None
     by_imu = [e.by_bias() for e in motion.influences]
-    if lag.size:
+    if numbers.size:
         by_imu = [
-            np.column_stack([by_entries(e, as_read[own], g, a), e.by_force(force_slope[own])])
+            np.column_stack(
+                [
+                    by_entries(e, as_read[own], g, a),
+                    *([by_apart(e, felt[own])] if felt.size else []),
+                    e.by_force(force_slope[own]),
+                ]
+            )
             for e, own, g, a in zip(motion.influences, motion.nodes, M_g, M_a, strict=True)
         ]
     return PreintegratedLinks(
@@ -80,9 +90,9 @@ class PreintegratedLinks(NamedTuple):
         dt: Lengths, s, shape (m,).
         dR, dv, dp: Relative rotations (m, 3, 3), and integrals of the specific force without gravity (m, 3).
         by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by the
-            sixteen numbers of `imu_scale` where they are estimated, shape (m, 9, 6) or (m, 9, 22).
+            numbers of `imu_scale` where they are estimated, shape (m, 9, q).
         root: W with W^T W = inverse covariance of [rotation, velocity, position], shape (m, 9, 9).
-        imu: Biases (and numbers) for which they were integrated, shape (m, 6) or (m, 22).
+        imu: Biases (and numbers) for which they were integrated, shape (m, 6), (m, 22) or (m, 28).
     """
 
     dt: FloatArray
@@ -112,7 +122,7 @@ class PreintegratedLinks(NamedTuple):
             R: Attitudes at the m + 1 images, shape (m + 1, 3, 3).
             p: Positions in the world, m, shape (m + 1, 3).
             v: Velocities in the world, m/s, shape (m + 1, 3).
-            imu: [gyro, accel] bias on each link, and its numbers, shape (m, q), q = 6 or 22.
+            imu: [gyro, accel] bias on each link, and its numbers, shape (m, q), q = 6, 22 or 28.
             gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
 
         Returns:

@@ -28,6 +28,8 @@ ENTRY_SIGMA = 2e-3
 """Scale or alignment of an IMU that is not as it says, each entry."""
 KNOWN_OFF_SIGMA = 1e-2
 """The same of an IMU that is known to be off, or whose matrices are asked for."""
+APART_SIGMA_M = 5e-3
+"""How far the axes of an accelerometer are from each other where they are chips of their own, m."""
 LAG_SIGMA_S = 3e-4
 """By how much the delays of accelerometer and gyro differ in an IMU where they do, s."""
 SIZE_SIGMA = 0.02

@@ -8,6 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.imu_scale import apart_of, positions_m
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -39,6 +40,7 @@ class MotionPoints(NamedTuple):
     gravity: FloatArray
     gyro_matrix: FloatArray | None
     accel_matrix: FloatArray | None
+    accel_positions: FloatArray | None = None
     accel_lag_s: FloatArray | None = None
 
 
@@ -60,6 +62,9 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         gyro_matrix = state.gyro_matrix + errors[:, layout.gyro_matrix].reshape(-1, 3, 3)
         accel_matrix = np.repeat(state.accel_matrix[None], len(errors), axis=0)
         accel_matrix[:, LOWER[:, 0], LOWER[:, 1]] += errors[:, layout.accel_matrix]
+    positions = None
+    if layout.accel_positions is not None:
+        positions = state.accel_positions + positions_m(errors[:, layout.accel_positions])
     return MotionPoints(
         state.R_world_imu @ rotation_from_grp(errors[:, ATTITUDE]),
         state.p_world_imu + errors[:, POSITION],
@@ -69,6 +74,7 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         tilted_gravity(state.gravity, state.tilt, errors[:, GRAVITY]),
         gyro_matrix,
         accel_matrix,
+        positions,
         None if layout.accel_lag is None else state.accel_lag_s + errors[:, layout.accel_lag],
     )
 
@@ -108,6 +114,9 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         gyro_matrix = gyro_matrix + dx[layout.gyro_matrix].reshape(3, 3)
         accel_matrix = accel_matrix.copy()
         accel_matrix.ravel()[LOWER_FLAT] += dx[layout.accel_matrix]
+    positions = state.accel_positions
+    if layout.accel_positions is not None:
+        positions = positions + positions_m(dx[layout.accel_positions])
     lag_s = state.accel_lag_s
     if layout.accel_lag is not None:
         lag_s += float(dx[layout.accel_lag])
@@ -129,6 +138,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         {name: moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
         gyro_matrix,
         accel_matrix,
+        positions,
         lag_s,
         scale,
         shape,
@@ -151,6 +161,8 @@ def difference(state: State, origin: State, layout: Layout) -> FloatArray:
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         dx[layout.gyro_matrix] = (state.gyro_matrix - origin.gyro_matrix).ravel()
         dx[layout.accel_matrix] = (state.accel_matrix - origin.accel_matrix)[LOWER[:, 0], LOWER[:, 1]]
+    if layout.accel_positions is not None:
+        dx[layout.accel_positions] = apart_of(state.accel_positions - origin.accel_positions)
     if layout.accel_lag is not None:
         dx[layout.accel_lag] = state.accel_lag_s - origin.accel_lag_s
     if layout.target_scale is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -79,13 +80,20 @@ def camera_snapshot(
     )
 
 
-def imu_snapshot(bias: FloatArray, sigma: FloatArray, matrices: Sequence[FloatArray] = ()) -> ImuEstimate:
+def imu_snapshot(
+    bias: FloatArray,
+    sigma: FloatArray,
+    matrices: Sequence[FloatArray] = (),
+    positions_m: FloatArray | None = None,
+) -> ImuEstimate:
     """Put what is reported of the imu together.
 
     Args:
         bias: Of gyro (rad/s) and accelerometer (m/s^2), shape (6,).
         sigma: Standard deviations, shape (6,).
         matrices: M_g and M_a where they are asked for, shape (3, 3) each.
+        positions_m: Of the accelerometer's axes where they are asked for, shape (3, 3).
     """
     blocks = [np.asarray(x).tolist() for x in (bias[:3], bias[3:], sigma[:3], sigma[3:])]
-    return ImuEstimate(*blocks, *(m.tolist() for m in matrices))
+    found = ImuEstimate(*blocks, *(m.tolist() for m in matrices))
+    return found if positions_m is None else replace(found, accel_positions_m=positions_m.tolist())

@@ -8,7 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import LAG_SIGMA_S, SKEW_SIGMA, StartSigmas
+from vical_daemon.estimation.model.priors import APART_SIGMA_M, LAG_SIGMA_S, SKEW_SIGMA, StartSigmas
 from vical_daemon.estimation.model.state import CameraState, Layout
 
 
@@ -32,6 +32,8 @@ def start_sigmas(
     s = np.zeros(layout.size)
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = imu_sigma
+    if layout.accel_positions is not None:
+        s[layout.accel_positions] = APART_SIGMA_M
     if layout.accel_lag is not None:
         s[layout.accel_lag] = LAG_SIGMA_S
     if layout.target_scale is not None:

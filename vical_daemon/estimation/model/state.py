@@ -59,6 +59,7 @@ class Layout:
         gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
         accel_matrix: 6 entries (lower triangle) of M_a - I; the lower triangle fixes the gauge, since a
             full matrix could be traded against R_imu_cam.
+        accel_positions: Positions of the accelerometer's axes, 6 numbers of `imu_scale`, m, or None.
         accel_lag: How late the accelerometer's readings are against the gyro's, s, index or None.
         cameras: By name.
         target_scale: Relative size of the board, index or None.
@@ -72,6 +73,7 @@ class Layout:
     dynamic: int
     gyro_matrix: slice | None
     accel_matrix: slice | None
+    accel_positions: slice | None
     accel_lag: int | None
     cameras: dict[str, CameraSlices]
     target_scale: int | None
@@ -136,6 +138,7 @@ def make_layout(
     places, held = _Places(core), dict(held or {})
     imu = "imu_intrinsics" in estimate
     gyro_matrix, accel_matrix = places.block(imu, 9), places.block(imu, 6)
+    accel_positions = places.block("size_effect" in estimate, 6)
     accel_lag = places.one("accel_lag" in estimate)
     dynamic = places.used
     blocks = {
@@ -146,7 +149,18 @@ def make_layout(
     modes = None if target_m is None else TargetModes.of(target_m)
     shape = places.block(modes is not None and "target_shape" in estimate, MODES)
     return Layout(
-        core, places.used, dynamic, gyro_matrix, accel_matrix, accel_lag, blocks, scale, shape, modes, held
+        core,
+        places.used,
+        dynamic,
+        gyro_matrix,
+        accel_matrix,
+        accel_positions,
+        accel_lag,
+        blocks,
+        scale,
+        shape,
+        modes,
+        held,
     )
 
 
@@ -220,6 +234,7 @@ class State:
         gyro_matrix: M_g in omega = M_g (omega_m - b_g).
         accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
         cameras: By name.
+        accel_positions: Of the accelerometer's axes x, y, z in the imu frame, m, shape (3, 3), of zero mean.
         accel_lag_s: The specific force stamped t is that of t - accel_lag_s; the gyro's stamps are right.
         target_scale: True size of the board over its stated size.
         target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
@@ -238,6 +253,7 @@ class State:
     cameras: dict[str, CameraState]
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_positions: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     accel_lag_s: float = 0.0
     target_scale: float = 1.0
     target_shape: FloatArray = field(default_factory=lambda: np.zeros(MODES))

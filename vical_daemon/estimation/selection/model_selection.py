@@ -34,7 +34,7 @@ def imu_and_lenses(
         found[IMU] = Block.of(where, numbers[:ENTRIES], ENTRY_SIGMA)
     if layout.accel_lag is not None:
         where = slice(layout.accel_lag, layout.accel_lag + 1)
-        found[LAG] = Block.of(where, numbers[ENTRIES:], LAG_SIGMA_S)
+        found[LAG] = Block.of(where, numbers[-1:], LAG_SIGMA_S)
     for name, lens in layout.held.items():
         now = np.concatenate([cameras[name].intrinsics, cameras[name].distortion])
         found[lens_block(name)] = Block.of_lens(layout.lens(name), lens, now)

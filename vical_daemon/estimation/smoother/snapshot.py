@@ -12,6 +12,7 @@ from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
 from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model import imu_scale
 from vical_daemon.estimation.model.imu_scale import matrices as matrices_of
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
@@ -115,4 +116,6 @@ def _over_clocks(carry: MarginalPrior, models: ReportedModels) -> tuple[FloatArr
 def imu_estimate(carry: MarginalPrior, *, matrices: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[BIASES])
-    return imu_snapshot(carry.bias, sigma, matrices_of(carry.imu) if matrices else ())
+    apart = carry.imu[imu_scale.APART]
+    positions_m = imu_scale.positions_m(apart) if apart.size else None
+    return imu_snapshot(carry.bias, sigma, matrices_of(carry.imu) if matrices else (), positions_m)

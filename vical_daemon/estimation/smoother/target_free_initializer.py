@@ -24,7 +24,7 @@ from vical_daemon.estimation.measurements import (
     FloatArray,
     Frames,
 )
-from vical_daemon.estimation.model.imu_scale import NUMBERS
+from vical_daemon.estimation.model import imu_scale
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
@@ -212,7 +212,8 @@ class TargetFreeInitializer:
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
         camera = camera_by_rotations(camera, prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         sigma = WINDOW_START.lever_arm_m if given is None else 1e-4
-        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
+        numbers = imu_scale.count(size_effect="size_effect" in self.options.estimate)
+        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + numbers)]), sigma, about)
 
     def _seeds(
         self,

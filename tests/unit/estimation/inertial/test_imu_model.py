@@ -85,6 +85,28 @@ def test_an_accelerometer_that_is_late_is_put_right():
     np.testing.assert_array_equal(put_right.dR, plain.dR)
 
 
+def apart_segment(T, rate, positions):
+    """Forces as axes at some positions measure them: at the origin, plus alpha x r + omega x (omega x r)."""
+    seg = late_segment(T, rate, 0.0)
+    for i, r in enumerate(positions):
+        felt = np.cross(seg.gyro_slope, r) + np.cross(seg.gyro, np.cross(seg.gyro, r))
+        seg.accel[:, i] += felt[:, i]
+    return seg
+
+
+def test_axes_of_an_accelerometer_that_are_apart_are_put_right():
+    zero, positions = (
+        np.zeros((1, 3)),
+        np.array([[-5e-3, 8e-3, -1e-3], [2e-3, -4e-3, 0.0], [3e-3, -4e-3, 1e-3]]),
+    )
+    plain = im.strapdown(late_segment(0.1, 200, 0.0), zero, zero)
+    wrong = im.strapdown(apart_segment(0.1, 200, positions), zero, zero)
+    put_right = im.strapdown(apart_segment(0.1, 200, positions), zero, zero, accel_positions=positions[None])
+    assert np.abs(wrong.dv - plain.dv).max() > 1e-4
+    np.testing.assert_allclose(put_right.dv, plain.dv, atol=1e-12)
+    np.testing.assert_array_equal(put_right.dR, plain.dR)
+
+
 def test_influence_of_a_force_agrees_with_differences_of_the_integration():
     seg, lags = late_segment(0.1, 200, 0.0), np.array([0.0, 1e-4])
     R0, zero = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix(), np.zeros((2, 3))

@@ -58,12 +58,13 @@ def test_layout_has_no_overlap_and_covers_everything():
     layout = st.make_layout(
         {"a": "radtan", "b": "plumb_bob"},
         fix=frozenset(),
-        estimate=frozenset({"imu_intrinsics", "accel_lag", "readout", "target_scale"}),
+        estimate=frozenset({"imu_intrinsics", "size_effect", "accel_lag", "readout", "target_scale"}),
     )
     used = np.zeros(layout.size, dtype=int)
     used[:17] += 1
     used[layout.gyro_matrix] += 1
     used[layout.accel_matrix] += 1
+    used[layout.accel_positions] += 1
     used[layout.accel_lag] += 1
     for c in layout.cameras.values():
         for s in (c.position, c.rotation, c.intrinsics, c.distortion):
@@ -72,7 +73,7 @@ def test_layout_has_no_overlap_and_covers_everything():
             used[i] += 1
     used[layout.target_scale] += 1
     assert (used == 1).all()
-    assert layout.dynamic == 33
+    assert layout.dynamic == 39
 
 
 def test_fixed_blocks_are_not_in_the_layout():

@@ -178,6 +178,21 @@ def test_a_true_imu_pays_nothing(as_specified):
     assert shot.status == "converged"
 
 
+def test_an_accelerometer_whose_axes_are_apart_is_estimated_where_asked_for():
+    positions = np.array([[-5e-3, 8e-3, -1e-3], [2e-3, -4e-3, 0.0], [3e-3, -4e-3, 1e-3]])
+    run = simulate(2, 20.0, rig=reference_rig(2, timeshift_cam_imu_s=0.01, accel_positions=positions))
+    options = CalibrationOptions(imu_noise=imu_noise(run), estimate=frozenset({"size_effect"}))
+    prior = camera_prior(run, 2, StartErrors(), exact_lens=False)
+    subject = CalibratorSubject(options, prior, run.points_m)
+    record = feed(run, subject)
+    assert all(largest_z(s) < 3.5 for s in record.snapshots)  # taken as at one point: 7 sigma, `converged`
+    assert record.snapshots[-1].status == "converged"
+    found = np.array(subject.calibrator.estimate().imu.accel_positions_m)
+    np.testing.assert_allclose(found, positions, atol=4e-3)
+    np.testing.assert_allclose(found.sum(axis=0), 0.0, atol=1e-12)
+    assert not record.events
+
+
 @pytest.mark.parametrize("late_ms", [-0.3, 0.3])
 def test_an_accelerometer_that_is_late_or_early_is_noticed_and_the_time_shift_is_the_gyros(late_ms):
     record = calibrated(2, 0.0, seconds=32.0, accel_lag_s=1e-3 * late_ms)  # taken as in step: 3 sigma off

@@ -84,7 +84,7 @@ def scene():
     return Scene()
 
 
-@pytest.mark.parametrize("numbers", [6, 22])
+@pytest.mark.parametrize("numbers", [6, 22, 28])
 def test_links_derivatives_agree_with_differences(scene, numbers):
     zero = np.zeros(numbers)
     links = make_links(scene.buffer, np.linspace(0.3, 0.45, 4), np.tile(zero, (3, 1)), scene.noise)
@@ -197,13 +197,15 @@ def test_start_finds_lever_arm_and_speed_linearly(scene):
     assert np.abs(np.linalg.norm(window.v, axis=1) - speed).max() < 0.1
 
 
-def test_links_follow_the_matrices_as_integrating_anew_does(scene):
-    """What a link says of other biases, matrices and lags, against one integrated for them."""
+@pytest.mark.parametrize("positions", [0, 6])
+def test_links_follow_the_matrices_as_integrating_anew_does(scene, positions):
+    """What a link says of other biases, matrices, positions and lags, against one integrated for them."""
     rng = np.random.default_rng(3)
     at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15), [2e-4]])
+    at = np.insert(at, 21, 2e-3 * rng.standard_normal(positions))
     link = _link(scene.buffer, 1.0, 1.25, at, scene.noise)
-    for k in range(22):
-        step = np.zeros(22)
+    for k in range(len(at)):
+        step = np.zeros(len(at))
         step[k] = 1e-4
         up, down = (_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
         turn = Rotation.from_matrix(down.dR[0].T @ up.dR[0]).as_rotvec()
