@@ -174,7 +174,7 @@ def test_taken_port_is_said():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         config = Config(web=WebConfig(enabled=True, port=taken.getsockname()[1]))
-        with pytest.raises(web.WebError, match=r"set web\.port"):
+        with pytest.raises(web.WebError, match=r"set web\.host or web\.port"):
             web.run(config, LocalBus(), threading.Event(), clock=private_clock())
 
 

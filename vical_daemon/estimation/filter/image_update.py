@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import lstsq
 
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray
@@ -120,7 +121,9 @@ def blurred(image: Image, innovation: FloatArray, lin: Linear) -> float:
     spare = r.size - ways.shape[1]
     if spare < LEAST_POINTS:
         return 1.0
-    left = r - (ways @ np.linalg.lstsq(ways, r.ravel())[0]).reshape(-1, 2)
+    # by QR: the SVD of numpy's does not always converge
+    explained = ways @ lstsq(ways, r.ravel(), lapack_driver="gelsy", check_finite=False)[0]
+    left = r - explained.reshape(-1, 2)
     noise = float(np.median(np.linalg.norm(left, axis=1))) / MEDIAN_RAYLEIGH * math.sqrt(r.size / spare)
     return max(noise, 1.0) if noise * float(np.median(sigma)) < MOST_PX else 1.0
 

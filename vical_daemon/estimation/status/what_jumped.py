@@ -9,6 +9,7 @@ on with all of these unknown. [docs/math/filter.md, "Detection of changes"]
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -315,6 +316,8 @@ def _suspects(
 
 
 def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:
-    """Take an image; return its log-likelihood, and whether it was used."""
+    """Take an image; return its log-likelihood, and whether it was used. A filter that diverged uses none."""
+    if not f.finite():
+        return -math.inf, False
     report = step(f, image[1], image[0])
     return (0.0, False) if report is None else (report.log_likelihood, report.used)
