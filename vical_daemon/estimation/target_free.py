@@ -81,7 +81,7 @@ class TargetFreeCalibrator:
         self.layout = make_layout(
             {self.camera: prior.distortion_model},
             fix=options.fix,
-            estimate=_ALWAYS,
+            estimate=_ALWAYS | ({"size_effect"} & options.estimate),
             held=None if lens is None else {self.camera: lens},
             core=CORE,
         )

@@ -138,3 +138,12 @@ def test_the_size_of_a_target_that_is_not_there_is_refused():
     options = CalibrationOptions(target_free=True, estimate=frozenset({"target_scale"}))
     with pytest.raises(ValueError, match="without a target there is no target_scale"):
         TargetFreeCalibrator(options, {"a": CameraPrior((640, 480))})
+
+
+def test_positions_of_the_accelerometers_axes_are_estimated_where_asked_for():
+    positions = np.array([[-5e-3, 8e-3, -1e-3], [2e-3, -4e-3, 0.0], [3e-3, -4e-3, 1e-3]])
+    _, calibrator, record = followed(2, {"size_effect"}, seconds=12.0, accel_positions=positions)
+    found = np.array(calibrator.estimate().imu.accel_positions_m)
+    np.testing.assert_allclose(found, positions, atol=5e-3)
+    shot = record.snapshots[-1]
+    assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7)

@@ -40,14 +40,7 @@ from vical_daemon.estimation.filter.unobservable_directions import UnobservableD
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
-from vical_daemon.estimation.measurements import (
-    IMAGE_GAP_S,
-    LEAST_POINTS,
-    BoolArray,
-    FloatArray,
-    ImuNoise,
-    PointsFrame,
-)
+from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import ROUNDING
@@ -58,7 +51,6 @@ from vical_daemon.estimation.model.state import (
     ATTITUDE,
     GRAVITY,
     GYRO_BIAS,
-    MOTION,
     Layout,
     MotionStart,
     State,
@@ -136,8 +128,6 @@ class CalibrationFilter:
         if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
             self.rates = rates_after(self.state, segment, self.rates)
             return
-        if float(segment.t_s[-1] - segment.t_s[0]) > IMAGE_GAP_S:
-            self._doubt_motion()
         state = self.state
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
@@ -150,18 +140,6 @@ class CalibrationFilter:
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self.rates = rates_after(state, segment, self.rates)
-
-    def _doubt_motion(self) -> None:
-        """Before a gap in the images, widen the motion by what their lasting errors add to its variance.
-
-        The covariance takes errors of the images for independent. From image to image that hardly matters;
-        over a gap of a second a wrong velocity moves all corners.
-        """
-        more = max((c.factor for c in self.consistency.values()), default=1.0) - 1.0
-        if more > 0.0:
-            columns = np.zeros_like(self.S)
-            columns[MOTION] = np.sqrt(more) * self.S[MOTION]
-            self.inflate_covariance(columns)
 
     def _predict_score(self, moved: Propagated, Q: FloatArray) -> None:
         if self.arm_score is not None:

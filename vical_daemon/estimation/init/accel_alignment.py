@@ -27,7 +27,7 @@ from vical_daemon.estimation.model.priors import (
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
-_STEP_S = 0.01  # between windows: a twentieth of their length, so that hardly any motion is lost
+_STEP_S = 0.01  # between windows, a fortieth of their length
 PRIORS = 9
 """Rows for these three vectors."""
 _MIN_WINDOWS = 12  # 36 equations for a rotation and three vectors
@@ -156,7 +156,7 @@ def _other_unknowns(
 
 _COARSE_S, _FINE_S = 0.02, 0.004  # grids of time shifts; a hand's acceleration changes over 0.1 s
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
-_MIN_CONTRAST = 4.0  # cost there over the least cost: two standard deviations against one
+_MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
 ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
 """So well mounting and time shift must be known for a start; after a long time, half as well will do."""
 _DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
