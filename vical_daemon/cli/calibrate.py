@@ -30,7 +30,8 @@ examples:
   vical export result.json --format kalibr -o camchain.yaml
 
 Mounting, lens and time shift are common to all recordings. Biases and the pose of the board are estimated
-for each. The clocks of the recordings need not be related.
+for each. The clocks of the recordings need not be related. Files into which one recording was split count as
+one: give them in order.
 
 exit code: 0 converged; 3 the result is only converging or degenerate (--accept makes that 0);
 1 no result; 2 bad usage

@@ -33,6 +33,9 @@ PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
 _PASSES = 3
 """A long lag of the accelerometer is found too short at first; the second time it is within an interval."""
 _APART_NS = 10_000_000_000  # between one recording and the next: more than any gap that is bridged
+_SPLIT_NS = 1_000_000_000
+"""Between two files of one recording, less: a recorder closes one and opens the next. Nobody who stops a
+recording and starts another is as quick."""
 
 
 @dataclass(slots=True)
@@ -44,7 +47,8 @@ class InputUse:
         begin_s: When it begins on the time axis of trace and events, which runs on over all recordings, s.
         duration_s: Seconds of it that were read.
         frames: Images of it in the result.
-        imu: Biases at its end, as in the result; None: it is not in the result.
+        imu: Biases at its end, as in the result; of a split recording at the end of its last file; None: it is
+            not in the result.
         timeshifts_s: By camera, at its end.
     """
 
@@ -188,8 +192,8 @@ class _Player:
             self.accel_late, self._stop = readings, True
         return replace(event, value=event.value + self._job.accel_late / rate_hz)
 
-    def play(self, part: Job, later_ns: int) -> None:
-        """Publish one recording, its stamps moved by `later_ns`."""
+    def play(self, part: Job, later_ns: int, *, ends: bool) -> None:
+        """Publish one file, its stamps moved by `later_ns`; `ends`: the recording does not go on after it."""
         keys = keys_of(self._job, part)
         sigma_s = part.recording.stamp_sigma_s
         moved = [sigma_s[x.name] for x in (part.imu, *part.cameras.values()) if x.name in sigma_s]
@@ -204,7 +208,8 @@ class _Player:
             if key != self._job.imu.key:
                 publish(self._bus, self.role.step())
                 self._show()
-        publish(self._bus, self.role.finish())
+        if ends:
+            publish(self._bus, self.role.finish())
 
     def _show(self) -> None:
         """Report the progress, ten times a second at most."""
@@ -214,38 +219,55 @@ class _Player:
 
 
 def _play_all(
-    parts: Sequence[Job], role: EstimateRole, play: Callable[[Job, int], None], *, common_clock: bool
+    parts: Sequence[Job], role: EstimateRole, play: Callable[..., None], *, common_clock: bool
 ) -> list[InputUse]:
     """Play one recording after the other on one time axis.
 
     The calibration goes on from one to the next. Where there is none yet at the end of a recording that could
-    go on, the next begins without it, and that recording is tried once more at the end.
+    go on, the next begins without it, and that recording is tried once more at the end. Files that continue
+    one another are one recording: nothing is found anew between them.
     """
-    order = list(range(len(parts)))
+    order = _continuous(parts)
+    count = len(order)
     uses: dict[int, InputUse] = {}
     free_ns, frames = parts[0].begin_ns, 0
-    for turn, number in enumerate(order):  # grows
-        part = parts[number]
-        later_ns = free_ns - part.begin_ns
-        play(part, later_ns)
-        assert role.latest is not None
-        duration_ns = round(part.duration_s * 1e9)
-        begin_s = (free_ns - parts[0].begin_ns) * 1e-9
-        of_it, frames = role.latest.frames - frames, role.latest.frames
-        free_ns += duration_ns + _APART_NS
-        goes_on = role.estimator.can_go_on
-        if not goes_on and turn < len(parts) - 1:
-            order.append(number)
-        ends = turn + 1 == len(order) or (turn + 1 >= len(parts) and not goes_on)
-        in_result = of_it > 0 and (goes_on or (ends and bool(role.latest.cameras)))
-        imu = asdict(role.latest.imu) if in_result and role.latest.imu is not None else None
-        shifts = {name: c.timeshift_cam_imu_s for name, c in role.latest.cameras.items()}
-        counted = of_it if imu else 0
-        uses[number] = InputUse(str(part.recording.path), begin_s, part.duration_s, counted, imu, shifts)
+    for turn, files in enumerate(order):  # grows
+        later_ns, of_it = free_ns - parts[files[0]].begin_ns, dict[int, int]()
+        for number in files:
+            play(parts[number], later_ns, ends=number == files[-1])
+            of_it[number], frames = _latest(role).frames - frames, _latest(role).frames
+        latest, goes_on = _latest(role), role.estimator.can_go_on
+        if not goes_on and turn < count - 1:
+            order.append(files)
+        ends = turn + 1 == len(order) or (turn + 1 >= count and not goes_on)
+        in_result = sum(of_it.values()) > 0 and (goes_on or (ends and bool(latest.cameras)))
+        imu = asdict(latest.imu) if in_result and latest.imu is not None else None
+        shifts = {name: c.timeshift_cam_imu_s for name, c in latest.cameras.items()}
+        for number in files:
+            part, counted = parts[number], of_it[number] if imu else 0
+            begin_s = (part.begin_ns + later_ns - parts[0].begin_ns) * 1e-9
+            uses[number] = InputUse(str(part.recording.path), begin_s, part.duration_s, counted, imu, shifts)
         if ends:
             break
+        free_ns = parts[files[-1]].end_ns + later_ns + _APART_NS
         role.next_recording(common_clock=common_clock)
     return [uses[number] for number in range(len(parts))]
+
+
+def _latest(role: EstimateRole) -> CalibrationEstimate:
+    assert role.latest is not None
+    return role.latest
+
+
+def _continuous(parts: Sequence[Job]) -> list[list[int]]:
+    """Numbers of the parts; those of files into which one recording was split are together."""
+    out = [[0]]
+    for number in range(1, len(parts)):
+        if abs(parts[number].begin_ns - parts[number - 1].end_ns) < _SPLIT_NS:
+            out[-1].append(number)
+        else:
+            out.append([number])
+    return out
 
 
 def _expected(part: Job) -> float:

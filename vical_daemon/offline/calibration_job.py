@@ -55,14 +55,18 @@ class Job:
         return self.recording.begin_ns + round(self.skip_s * 1e9)
 
     @property
+    def end_ns(self) -> int:
+        """Stamp up to which it is used."""
+        return self.begin_ns + round(self.duration_s * 1e9)
+
+    @property
     def parts(self) -> list[Job]:
         """This recording and the others."""
         return [self, *self.others]
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Yield (key, payload) of the streams and the part of the recording that are used."""
-        begin_ns = self.begin_ns
-        end_ns = begin_ns + round(self.duration_s * 1e9)
+        begin_ns, end_ns = self.begin_ns, self.end_ns
         statuses = [topics.STATUS.key(self.recording.rig, "imu")]  # they say how well stamps are known
         shift = AccelShift(self.accel_late)
         for key, payload in self.recording.messages([self.imu, *self.cameras.values()], statuses):
