@@ -47,8 +47,8 @@ class InputUse:
         begin_s: When it begins on the time axis of trace and events, which runs on over all recordings, s.
         duration_s: Seconds of it that were read.
         frames: Images of it in the result.
-        imu: Biases at its end, as in the result; of a split recording at the end of its last file; None: it is
-            not in the result.
+        imu: Biases at its end, as in the result, or of a split recording at the end of its last file; None: it
+            is not in the result.
         timeshifts_s: By camera, at its end.
     """
 
@@ -235,8 +235,10 @@ def _play_all(
         later_ns, of_it = free_ns - parts[files[0]].begin_ns, dict[int, int]()
         for number in files:
             play(parts[number], later_ns, ends=number == files[-1])
-            of_it[number], frames = _latest(role).frames - frames, _latest(role).frames
-        latest, goes_on = _latest(role), role.estimator.can_go_on
+            seen = role.latest.frames if role.latest is not None else 0
+            of_it[number], frames = seen - frames, seen
+        latest, goes_on = role.latest, role.estimator.can_go_on
+        assert latest is not None
         if not goes_on and turn < count - 1:
             order.append(files)
         ends = turn + 1 == len(order) or (turn + 1 >= count and not goes_on)
@@ -252,11 +254,6 @@ def _play_all(
         free_ns = parts[files[-1]].end_ns + later_ns + _APART_NS
         role.next_recording(common_clock=common_clock)
     return [uses[number] for number in range(len(parts))]
-
-
-def _latest(role: EstimateRole) -> CalibrationEstimate:
-    assert role.latest is not None
-    return role.latest
 
 
 def _continuous(parts: Sequence[Job]) -> list[list[int]]:
