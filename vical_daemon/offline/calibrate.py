@@ -47,8 +47,8 @@ class InputUse:
         begin_s: When it begins on the time axis of trace and events, which runs on over all recordings, s.
         duration_s: Seconds of it that were read.
         frames: Images of it in the result.
-        imu: Biases at its end, as in the result, or of a split recording at the end of its last file; None: it
-            is not in the result.
+        imu: Biases at its end, as in the result, or, of a split recording, at the end of its last file; None:
+            it is not in the result.
         timeshifts_s: By camera, at its end.
     """
 
