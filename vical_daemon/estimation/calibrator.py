@@ -295,6 +295,8 @@ class Calibrator:
         segment = self._buffer.segment(f.state.t_s, max(t_s, f.state.t_s))
         if segment is None:
             return None
+        if t_s - f.state.t_s > self._intake.longest_s(frame.camera):
+            f.doubt_motion()
         f.predict(segment)  # of no length at the first image: that one, too, must know how the rig turns
         if len(frame.ids) < LEAST_POINTS:
             return None

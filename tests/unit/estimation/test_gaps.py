@@ -12,6 +12,7 @@ from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.init.motion_restart import MotionRestart
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
@@ -297,3 +298,29 @@ def test_a_step_of_milliseconds_is_a_step_and_no_bump(step_s):
     assert [e.value for e in found] == pytest.approx([step_s], abs=3e-4)
     cam = estimate.cameras["cam0"]
     assert abs(cam.timeshift_cam_imu_s - rig.timeshift_cam_imu_s - step_s) < 4.0 * cam.timeshift_sigma_s
+
+
+@pytest.mark.parametrize(("every", "widened"), [(1, 1), (12, 0)], ids=["20 Hz", "1.7 Hz"])
+def test_motion_is_less_certain_after_a_gap_than_errors_that_last_make_it(run, monkeypatch, every, widened):
+    """Not at the usual interval of a slow camera, though it is as long as a gap of another."""
+    sigmas = []
+
+    def doubt_motion(f):
+        f.consistency["cam0"].factor = 4.0
+        before = f.sigmas()
+        widen(f)
+        sigmas.append(f.sigmas() / before)
+
+    widen = CalibrationFilter.doubt_motion
+    monkeypatch.setattr(CalibrationFilter, "doubt_motion", doubt_motion)
+
+    def change(items):
+        images = [x for x in items if x[1]]
+        gone = {x[2] for k, x in enumerate(images) if k % every or 17.0 < x[0] < 18.0}
+        return [x for x in items if x[2] not in gone or not x[1]]
+
+    estimate, events, _ = calibrate(run, change)
+    assert [round(float(s[3]), 6) for s in sigmas] == [2.0] * widened and estimate.cameras
+    for s in sigmas:
+        np.testing.assert_allclose(s, [2.0] * 9 + [1.0] * (len(s) - 9), rtol=1e-6)
+    assert [e.kind for e in events] == [EventKind.IMAGE_GAP] * widened

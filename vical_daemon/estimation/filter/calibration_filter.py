@@ -51,6 +51,7 @@ from vical_daemon.estimation.model.state import (
     ATTITUDE,
     GRAVITY,
     GYRO_BIAS,
+    MOTION,
     Layout,
     MotionStart,
     State,
@@ -140,6 +141,18 @@ class CalibrationFilter:
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self.rates = rates_after(state, segment, self.rates)
+
+    def doubt_motion(self) -> None:
+        """Before a gap in the images, widen the motion by what their lasting errors add to its variance.
+
+        The covariance takes errors of the images for independent. From image to image that hardly matters;
+        over a gap of a second a wrong velocity moves all corners.
+        """
+        more = max((c.factor for c in self.consistency.values()), default=1.0) - 1.0
+        if more > 0.0:
+            columns = np.zeros_like(self.S)
+            columns[MOTION] = np.sqrt(more) * self.S[MOTION]
+            self.inflate_covariance(columns)
 
     def _predict_score(self, moved: Propagated, Q: FloatArray) -> None:
         if self.arm_score is not None:

@@ -54,6 +54,11 @@ class _Stream:
     most_s: float = -np.inf
     last_s: float = 0.0
 
+    @property
+    def longest_s(self) -> float:
+        """Longest interval between images that is no gap, s; inf: not known yet."""
+        return max(IMAGE_GAP_S, GAP_PERIODS * self.usual_s)
+
     def follow(self, lead_s: float) -> None:
         """Follow the lead of an image that was taken, s."""
         self.lead_s += _FOLLOW * (lead_s - self.lead_s)
@@ -176,7 +181,7 @@ class ImageIntake:
         """
         gap_s = t_s - stream.newest_s
         set_forwards = stream.off_s > 0.5 * gap_s
-        if gap_s > max(IMAGE_GAP_S, GAP_PERIODS * stream.usual_s):  # the status counts single lost images
+        if gap_s > stream.longest_s:  # the status counts single lost images
             kind = EventKind.IMAGE_REPEATED if stream.repeats else EventKind.IMAGE_GAP
             if not set_forwards:
                 self._news.append(Event(kind, frame.camera, gap_s))
@@ -188,6 +193,10 @@ class ImageIntake:
     def offset_s(self, camera: str) -> float:
         """Time shift by the stamps as they come now, minus the time shift by the axis without steps, s."""
         return self._streams[camera].offset_s if camera in self._streams else 0.0
+
+    def longest_s(self, camera: str) -> float:
+        """Longest interval between images of a camera that is no gap, s; inf: not known yet."""
+        return self._streams[camera].longest_s if camera in self._streams else np.inf
 
     def news(self) -> list[Event]:
         """Gaps and steps since the last call."""

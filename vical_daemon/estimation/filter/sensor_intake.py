@@ -37,6 +37,10 @@ class SensorIntake:
         """The readings, s since the first stamp; None before the first one."""
         return self._imu.buffer
 
+    def longest_s(self, camera: str) -> float:
+        """Longest interval between images of a camera that is no gap, s."""
+        return self._images.longest_s(camera)
+
     @property
     def gap_end_s(self) -> float:
         """Where readings resumed after the latest gap, s; -inf: there was none."""
