@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.geometry import so3
@@ -149,14 +148,12 @@ class Found(NamedTuple):
             may have moved: just before the jump, as the motion is found again as after any lost pose. If no
             jump explains the images: the filter given.
         before: The filter just before the jump.
-        at: The image that it has not taken yet.
     """
 
     part: Part
     possible: frozenset[Part]
     filter: CalibrationFilter
     before: CalibrationFilter
-    at: int = 0
 
 
 def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found:
@@ -195,14 +192,14 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
     best = max(possible, key=lambda part: found[part].likelihood)
     k = found[best].at
     if total > none + odds and possible == {Part.TARGET}:
-        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k], k)
+        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k])
     if total > none + odds:
         unknown = {part: found[part].sizes for part in possible}
         after = _follow_after(filters[k], unknown, images[k:], camera, step)
         for consistency in after.filter.consistency.values():
             consistency.settle()
         if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
-            return Found(best, frozenset(possible), after.filter, filters[k], k)
+            return Found(best, frozenset(possible), after.filter, filters[k])
     return Found(Part.NONE, frozenset(), before, before)
 
 
@@ -267,12 +264,6 @@ def _follow_after(
     likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
     f.jumped = None
     return _After(f, sum(likelihoods), used, jumped)
-
-
-def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
-    """Return the event of a lens that jumped, with the difference of fx."""
-    focal = (f.state.cameras[camera].intrinsics[0] for f in (after, before))
-    return Event(EventKind.LENS_STEPPED, camera, float(np.subtract(*focal)))
 
 
 def _suspects(
