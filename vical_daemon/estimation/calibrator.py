@@ -378,9 +378,10 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        part, possible, f, known = what_jumped(before, self._past.since(before), camera, self._step)
-        if part is Part.NONE or (stepped and part in (Part.SHIFT, Part.DRIFT)):
+        found = what_jumped(before, self._past.since(before), camera, self._step)
+        if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):
             return False
+        part, possible, f, known = found
         cameras = known.state.cameras
         change = PendingChange(part, possible, camera, f.state.t_s, cameras).after(self._change)
         change.tell(f, before, self.evaluator, self.watch.why)

@@ -17,7 +17,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import SPEED, LinearMotion, linear_start
+from vical_daemon.estimation.init.linear_start import LEAST_IMAGES, SPEED, LinearMotion, linear_start
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
@@ -30,7 +30,6 @@ from vical_daemon.estimation.model.state import (
     State,
 )
 
-_LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""
@@ -110,7 +109,7 @@ class MotionRestart:
         state = f.state
         if not self._begins_well(f):
             return None
-        poses = self._enough_poses(state, _LEAST_IMAGES, _LEAST_S)
+        poses = self._enough_poses(state, LEAST_IMAGES, _LEAST_S)
         if poses is None:
             return None
         t_s, R = poses.t_s, poses.R
