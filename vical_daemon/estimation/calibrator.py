@@ -7,6 +7,7 @@ short lag (so that inertial data always bracket each image) -> `evaluator` says 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from copy import deepcopy
 
 import numpy as np
 
@@ -241,8 +242,6 @@ class Calibrator:
             item = self._pending.pop(shifts, covered_s, flush=flush)
             if item is None:
                 break
-            if self._change is not None:
-                self._change.images.append(item)
             if self._late.take(self.filter, *item):
                 if self.filter.unobservable is not None:  # a full start is still to come
                     self._initializer.take([item])
@@ -345,7 +344,7 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action.asks and (self._nothing_changed() or self._part_changed(f, suspect(f, frame))):
+        if action.asks and self._part_changed(f, suspect(f, frame)):
             return
         if action is Action.POSE:
             self._lose_motion(jumped=True)
@@ -358,18 +357,6 @@ class Calibrator:
         elif action is Action.RESTART:
             self._restart(f)
 
-    def _nothing_changed(self) -> bool:
-        """See whether images fit what was known before a change; if they do, they were wrong for a while."""
-        refused, change = self.watch.why is Cause.IMAGES_REFUSED, self._change
-        f = change.undone(self._step) if change is not None and refused else None
-        if f is None:
-            return False
-        self.filter, self._change, self._lost = f, None, None
-        self._past.changed(f)
-        self.watch.shift_reopened()
-        self.evaluator.nothing_changed(f.state.t_s)
-        return True
-
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
         """See whether images no longer fit because something jumped; go on with all of that unknown."""
         assert self._buffer is not None
@@ -381,8 +368,8 @@ class Calibrator:
             fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera, stepped=stepped)
-        change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, before, self._past.since(before))
-        self._change = change.after(self._change)
+        known = deepcopy(before.state.cameras)
+        self._change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, known).after(self._change)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
@@ -393,11 +380,12 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        images = self._past.since(before)
-        part, possible, f, known, at = what_jumped(before, images, camera, self._step)
-        if part is Part.NONE or (stepped and part in (Part.SHIFT, Part.DRIFT)):
+        found = what_jumped(before, self._past.since(before), camera, self._step)
+        if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):
             return False
-        change = PendingChange(part, possible, camera, f.state.t_s, known, images[at:]).after(self._change)
+        part, possible, f, known = found
+        cameras = known.state.cameras
+        change = PendingChange(part, possible, camera, f.state.t_s, cameras).after(self._change)
         change.tell(f, before, self.evaluator, self.watch.why)
         self.filter, self._change = f, change
         self._past.changed(f)

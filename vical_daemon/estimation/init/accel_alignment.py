@@ -24,6 +24,7 @@ from vical_daemon.estimation.model.priors import (
     GYRO_BIAS_SIGMA_RPS,
     WINDOW_START,
 )
+from vical_daemon.estimation.temporal.rotation_curves import running_integral
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
@@ -240,6 +241,30 @@ def align_at(
     return _alignment(evidence, imu_rows, Rs[0], scale, across, (shift_s, 0.0, np.inf))
 
 
+def force_misfits(path: CameraPath, imu_rows: FloatArray, maps: FloatArray) -> FloatArray | None:
+    """How well the specific force fits the camera's accelerations if it is mapped into the camera's frame.
+
+    Args:
+        path: Of the camera, in the imu's clock.
+        imu_rows: As for `align`.
+        maps: From the imu's frame to the camera's, rotations or not, shape (k, 3, 3).
+
+    Returns:
+        Rms of the accelerations that are left, over their sigmas, shape (k,), with the best gravity, lever
+        arm and bias; None where there are too few poses in a row.
+    """
+    evidence = gather(path)
+    if evidence is None:
+        return None
+    D = _Reduced.at(evidence, _with_angles(imu_rows), 0.0).D
+    n = 3 * len(evidence.accel_sigma)
+    rows = [*range(n), *range(len(D) - PRIORS, len(D))]  # without the turns
+    basis = np.linalg.qr(evidence.others[rows, :9])[0]
+    left = evidence.seen[rows, None] - D[rows] @ maps.reshape(-1, 9).T
+    left -= basis @ (basis.T @ left)
+    return np.asarray(np.sqrt(np.mean(left[:n] ** 2, axis=0)))
+
+
 def _alignment(
     evidence: Evidence,
     rows: FloatArray,
@@ -258,9 +283,7 @@ def _alignment(
 
 def _with_angles(rows: FloatArray) -> FloatArray:
     """Append the integral of the rates, rad, as three columns: over a fifth of a second nearly the turn."""
-    steps = np.diff(rows[:, 0])[:, None]
-    angle = np.cumsum(0.5 * (rows[1:, 1:4] + rows[:-1, 1:4]) * steps, axis=0)
-    return np.hstack([rows, np.vstack([np.zeros(3), angle])])
+    return np.hstack([rows, running_integral(np.diff(rows[:, 0]), rows[:, 1:4])])
 
 
 @dataclass(frozen=True)
@@ -270,7 +293,7 @@ class _Reduced:
     A: FloatArray
     b: FloatArray
     c: float
-    _D: FloatArray
+    D: FloatArray
     _y: FloatArray
     _others: FloatArray
 
@@ -296,7 +319,7 @@ class _Reduced:
 
     def turn_bias(self, r: FloatArray) -> FloatArray:
         """The gyro's bias in the camera frame that goes with r, rad/s, shape (3,)."""
-        found = np.linalg.lstsq(self._others, self._y - self._D @ r, rcond=None)[0]
+        found = np.linalg.lstsq(self._others, self._y - self.D @ r, rcond=None)[0]
         return np.asarray(found[9:], dtype=np.float64)
 
 

@@ -22,6 +22,7 @@ from vical_daemon.estimation.filter.linearise import Image, by_small_steps, is_r
 from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.linear_start import LEAST_IMAGES
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import (
     LEAST_POINTS,
@@ -48,7 +49,6 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mc
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
-_LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
@@ -167,7 +167,7 @@ class BoardWindow:
     ) -> BoardWindow | None:
         """Choose images, and put the rig at each where the pose of the camera has it."""
         nodes = _nodes(state, poses, frames, buffer)
-        if len(nodes) < _LEAST_IMAGES:
+        if len(nodes) < LEAST_IMAGES:
             return None
         links = _integrated(nodes, state, prior.imu_noise, buffer)
         if links is None:

@@ -27,6 +27,7 @@ from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2
 
+LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 SPEED, GRAVITY, ARM, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 """Places in z."""
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import SPEED, LinearMotion, linear_start
+from vical_daemon.estimation.init.linear_start import LEAST_IMAGES, SPEED, LinearMotion, linear_start
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
@@ -30,7 +30,6 @@ from vical_daemon.estimation.model.state import (
     State,
 )
 
-_LEAST_IMAGES = 3  # two intervals: with one, no acceleration shows
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""
@@ -110,8 +109,8 @@ class MotionRestart:
         state = f.state
         if not self._begins_well(f):
             return None
-        poses = self._poses(state)
-        if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
+        poses = self._enough_poses(state, LEAST_IMAGES, _LEAST_S)
+        if poses is None:
             return None
         t_s, R = poses.t_s, poses.R
         found = LinearMotion.between(buffer, t_s, R, state.gyro_bias)
@@ -134,17 +133,23 @@ class MotionRestart:
                 return True
         return bool(self.frames) and self.frames[-1][0] - self.frames[0][0] > _WAIT_S
 
-    def _poses(self, state: State) -> Poses | None:
-        """Poses of the imu by the images collected and the calibration as it is known."""
+    def _enough_poses(self, state: State, least: int, least_s: float) -> Poses | None:
+        """Poses of the imu by the images collected and the calibration as it is known.
+
+        Args:
+            state: With that calibration.
+            least: Fewer poses give None.
+            least_s: So do poses over less than this, s.
+        """
         seen = [s for s in self._seen if s is not None]
-        if not seen:
+        if len(seen) < least:
             return None
         cameras = [_camera(state, s.frame) for s in seen]
         t_s = np.array([s.t_cam_s + c.timeshift_s for s, c in zip(seen, cameras, strict=True)])
         R = np.array([s.R_target_cam @ c.R_imu_cam.T for s, c in zip(seen, cameras, strict=True)])
         arms = np.array([c.p_imu_cam for c in cameras])
         p = np.array([s.p_target_cam for s in seen]) - np.einsum("nij,nj->ni", R, arms)
-        return Poses(t_s, R, p, seen[0])
+        return Poses(t_s, R, p, seen[0]) if t_s[-1] - t_s[0] >= least_s else None
 
     def _elapsed_s(self, frame: PointsFrame, by_imu_s: float) -> float:
         """Time since the motion was lost: the less of what both clocks say, for either may have been set."""

@@ -48,8 +48,8 @@ class RecordingStart(MotionRestart):
     def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
         """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
         state = f.state
-        poses = self._poses(state)
-        if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
+        poses = self._enough_poses(state, _LEAST_IMAGES, _LEAST_S)
+        if poses is None:
             return None
         gyro_bias = _gyro_bias(buffer, poses.t_s, poses.R)
         if gyro_bias is None:
@@ -58,8 +58,7 @@ class RecordingStart(MotionRestart):
         if found is None:
             return None
         start = _linear(found, poses.p, state)
-        span_s = float(poses.t_s[-1] - poses.t_s[0])
-        wide = sigmas_of_motion(poses.first, f, span_s)
+        wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
         biases = BiasStart(
             gyro_bias,
             start.accel_bias,
@@ -74,8 +73,8 @@ class RecordingStart(MotionRestart):
 
     def gyro_bias(self, state: State, buffer: ImuBuffer) -> FloatArray:
         """Bias of the gyro by the images so far, rad/s, shape (3,); the state's where they say nothing."""
-        poses = self._poses(state)
-        found = None if poses is None or len(poses.t_s) < 3 else _gyro_bias(buffer, poses.t_s, poses.R)
+        poses = self._enough_poses(state, 3, 0.0)
+        found = None if poses is None else _gyro_bias(buffer, poses.t_s, poses.R)
         return state.gyro_bias if found is None else found
 
 

@@ -22,7 +22,6 @@ from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import OFF
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 
-_MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9  # probability of a hypothesis that is left out of the mixture
 
 Weights = dict[tuple[str, ...], float]
@@ -193,7 +192,7 @@ def log_bayes_factor(
         # with C = L L' and M M' = I + (factor - 1) L'L: I + (C^-1 - I) / factor = L^-T M M' L^-1 / factor
         M = root(np.eye(len(values)) + (factor - 1.0) * (L.T @ L))
         fitted, size = solve_lower(M, standard), size + np.log(M.diagonal()).sum()
-    off = 0.5 * min(float(fitted @ fitted) / factor, 2.0 * _MOST) - float(size)
+    off = 0.5 * float(fitted @ fitted) / factor - float(size)
     if share is None or not share.any():
         return off
     inverse = solve_lower(L, np.diag(share))  # with the share of each value on its right
@@ -205,7 +204,7 @@ def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
     """Logarithm of how likely data are under a prior of unit variance, over that under exact zeros."""
     L = root(np.eye(len(weighted)) + learnt)
     fitted = solve_lower(L, weighted)
-    return 0.5 * min(float(fitted @ fitted), 2.0 * _MOST) - float(np.log(L.diagonal()).sum())
+    return 0.5 * float(fitted @ fitted) - float(np.log(L.diagonal()).sum())
 
 
 def posterior(

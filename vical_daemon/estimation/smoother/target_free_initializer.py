@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
@@ -31,11 +30,8 @@ from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
 from vical_daemon.estimation.smoother.window import Window
-from vical_daemon.estimation.temporal.camera_orientations import Orientations as CameraOrientations
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S
-from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES, track_orientations
 
@@ -237,11 +233,6 @@ class TargetFreeInitializer:
         chain = max(chains, key=lambda c: len(c.t_cam_ns))
         chained = set(chain.t_cam_ns.tolist())
         t_cam = np.array([s for s, f in frames if f.t_cam_ns in chained])
-        if prior.T_imu_cam is not None:
-            curve = GyroCurve.integrate(t, gyro, np.zeros(3))
-            stepped = nearest_shift(curve, _chained(t_cam, chain), *seeds[0], SEARCHED_S)
-            if stepped is not None:
-                seeds.append((seeds[0][0], stepped))
         result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
         if result.timeshift_cam_imu_s is None or result.R_imu_cam is None or result.status == "refused":
             return seeds, result.reason
@@ -284,12 +275,6 @@ def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
 
 def _known(known: MarginalPrior) -> _Found:
     return _Found(deepcopy(known.camera), np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
-
-
-def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
-    """Orientations strung together: their errors add up from the first on."""
-    walked = np.cumsum(np.trace(chain.covariance, axis1=1, axis2=2) / 3.0)
-    return Orientations(t_cam_s, chain.R_world_cam, np.sqrt(walked))
 
 
 def _misfit(fit: EpipolarFit) -> float:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.filter.unobservable_directions import HELD_M
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
@@ -208,5 +209,5 @@ def _upright(down: FloatArray) -> FloatArray:
     cosine = float(down @ target)
     if cosine < -0.999999:
         return np.diag([1.0, -1.0, -1.0])
-    hat = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    hat = so3.hat(axis)
     return np.asarray(np.eye(3) + hat + hat @ hat / (1.0 + cosine))

@@ -10,9 +10,8 @@ import numpy.typing as npt
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import CameraEstimate
-from vical_daemon.estimation.significance import chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 
-_SIGMAS = 4.0  # of what both estimates leave open
 IRRELEVANT_M, _IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 """Smaller changes are not announced, however significant: thermal play of a mount."""
 IRRELEVANT_PX = 1.0  # likewise of fx: 1 px at the edge of an image 90 deg wide
@@ -44,7 +43,7 @@ def differences(
     if _differs(turn_rad, covariance[3:, 3:], _IRRELEVANT_RAD):
         found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
     sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
-    if abs(shift_s) > max(_SIGMAS * sigma_s, IRRELEVANT_S):
+    if abs(shift_s) > max(LIKELY_SIGMAS * sigma_s, IRRELEVANT_S):
         found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
     return [Event(kind, camera, value, sigma, t_s, cause) for kind, value, sigma in found]
 
@@ -53,7 +52,7 @@ def lens_difference(camera: str, before: CameraEstimate, now: CameraEstimate, t_
     """Return the significant difference of the focal length fx, of 1 px and more; arguments as above."""
     step_px = now.intrinsics[0] - before.intrinsics[0]
     sigma_px = math.hypot(now.intrinsics_sigma[0], before.intrinsics_sigma[0])
-    if abs(step_px) <= max(_SIGMAS * sigma_px, IRRELEVANT_PX):
+    if abs(step_px) <= max(LIKELY_SIGMAS * sigma_px, IRRELEVANT_PX):
         return []
     return [Event(EventKind.LENS_STEPPED, camera, step_px, sigma_px, t_s)]
 
@@ -62,7 +61,7 @@ def visible_move_m(before: CameraEstimate, now: CameraEstimate) -> float:
     """Return the least move of a camera, in any direction, that `differences` reports, m."""
     covariance = np.asarray(before.T_imu_cam.covariance) + np.asarray(now.T_imu_cam.covariance)
     widest = max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0)
-    return max(IRRELEVANT_M, math.sqrt(chi_square_limit(3, _SIGMAS) * widest))
+    return max(IRRELEVANT_M, math.sqrt(chi_square_limit(3, LIKELY_SIGMAS) * widest))
 
 
 def _differs(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64], irrelevant: float) -> bool:
@@ -71,7 +70,9 @@ def _differs(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64
         return False
     values, axes = np.linalg.eigh(covariance)  # one of a fixed mounting is zero
     along = (axes.T @ vector) ** 2
-    return bool(np.sum(along / np.maximum(values, 1e-12 * irrelevant**2)) > chi_square_limit(3, _SIGMAS))
+    return bool(
+        np.sum(along / np.maximum(values, 1e-12 * irrelevant**2)) > chi_square_limit(3, LIKELY_SIGMAS)
+    )
 
 
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:

@@ -100,10 +100,10 @@ class RecentPast:
         """
         newer = self.since(f)
         own = [(t, frame) for t, frame in newer if frame.camera == camera]
-        seen, rows = _orientations(own, f, target), buffer.rows
-        if seen is None or len(rows) < 2:
+        seen = _orientations(own, f, target)
+        if seen is None or len(buffer) < 2:
             return []
-        curve, known = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias), f.state.cameras
+        curve, known = _curve(buffer, f), f.state.cameras
         shift_s = known[camera].timeshift_s
         at = first_after_step(curve, seen, known[camera].R_imu_cam, (shift_s, fit.timeshift_s))
         if at is None:
@@ -129,13 +129,17 @@ class RecentPast:
         seen = _orientations(frames, f, target)
         if seen is None or len(buffer) < 2:
             return None
-        known, rows = f.state.cameras[frames[0][1].camera], buffer.rows
-        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
+        curve, known = _curve(buffer, f), f.state.cameras[frames[0][1].camera]
         used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
         sound_s = min(frames[0][0], f.state.t_s - known.timeshift_s)
         before = _orientations([x for x in used if x[0] < sound_s][-_BEFORE_IMAGES:], f, target)
         level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
+
+
+def _curve(buffer: ImuBuffer, f: CalibrationFilter) -> GyroCurve:
+    """Turns of the imu by the readings and the bias that a filter knows."""
+    return GyroCurve.integrate(buffer.rows[:, 0], buffer.rows[:, 1:4], f.state.gyro_bias)
 
 
 def _orientations(frames: Frames, f: CalibrationFilter, target: FloatArray) -> Orientations | None:

@@ -101,14 +101,6 @@ class StatusEvaluator(Evaluator):
         if self._named:
             self.announce_change(why)
 
-    def nothing_changed(self, t_s: float) -> None:
-        """Images at `t_s` fit what was known before a change, which is known again."""
-        self.jumped(t_s)
-        if self._named:
-            same = {name: visible_move_m(before, before) for name, before in self._before.items()}
-            self.announce_all(Event(EventKind.NOT_BUMPED, name, visible) for name, visible in same.items())
-        self._before, self._named = {}, True
-
     def changed(self, why: Cause) -> None:
         """The rig has changed: the calibration is found again."""
         self._named = True

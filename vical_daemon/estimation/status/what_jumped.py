@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.geometry import so3
@@ -54,7 +53,6 @@ class Part(Enum):
     KNOCK: a mounting and the time shift of its camera.
     """
 
-    NONE = auto()
     SHIFT = auto()
     DRIFT = auto()
     MOUNTING = auto()
@@ -143,23 +141,19 @@ class Found(NamedTuple):
 
     Attributes:
         part: The one that explains the images best.
-        possible: Parts that may have jumped: that one, and those that explain the images nearly as well;
-            empty: no jump explains them.
+        possible: Parts that may have jumped: that one, and those that explain the images nearly as well.
         filter: After the images; the possible parts are unknown to it from the jump on. If only the target
-            may have moved: just before the jump, as the motion is found again as after any lost pose. If no
-            jump explains the images: the filter given.
+            may have moved: just before the jump, as the motion is found again as after any lost pose.
         before: The filter just before the jump.
-        at: The image that it has not taken yet.
     """
 
     part: Part
     possible: frozenset[Part]
     filter: CalibrationFilter
     before: CalibrationFilter
-    at: int = 0
 
 
-def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found:
+def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found | None:
     """Find which part of the calibration of a camera jumped, or whether the target did.
 
     Args:
@@ -167,6 +161,9 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
         images: Since then, of all cameras, in order.
         camera: The one whose images do not fit.
         step: Takes an image with a filter.
+
+    Returns:
+        None where no jump explains the images.
     """
     odds = _ODDS * before.consistency[camera].strictness
     none, refused, instants = _suspects(before, images, camera, step, odds)
@@ -185,25 +182,23 @@ def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: St
             if jump.likelihood > found.get(part, _Jump(none)).likelihood:
                 found[part] = jump
         likelihood += _follow(f, image, step)[0]
-    if not found:
-        return Found(Part.NONE, frozenset(), before, before)
-    total = max(jump.likelihood for jump in found.values())
+    total = max((jump.likelihood for jump in found.values()), default=none)
+    if not total > none + odds:
+        return None
     possible = {part for part, jump in found.items() if jump.likelihood > total - odds}
     for part, others in _NOT_BESIDE:
         if possible & others:
             possible.discard(part)
     best = max(possible, key=lambda part: found[part].likelihood)
     k = found[best].at
-    if total > none + odds and possible == {Part.TARGET}:
-        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k], k)
-    if total > none + odds:
-        unknown = {part: found[part].sizes for part in possible}
-        after = _follow_after(filters[k], unknown, images[k:], camera, step)
-        for consistency in after.filter.consistency.values():
-            consistency.settle()
-        if _most(after.used) and _most([after.used[at - k] for at in refused if at >= k]):
-            return Found(best, frozenset(possible), after.filter, filters[k], k)
-    return Found(Part.NONE, frozenset(), before, before)
+    if possible == {Part.TARGET}:
+        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k])
+    unknown = {part: found[part].sizes for part in possible}
+    after = _follow_after(filters[k], unknown, images[k:], camera, step)
+    for consistency in after.filter.consistency.values():
+        consistency.settle()
+    fits = _most(after.used) and _most([after.used[at - k] for at in refused if at >= k])
+    return Found(best, frozenset(possible), after.filter, filters[k]) if fits else None
 
 
 def _most(used: Sequence[bool]) -> bool:
@@ -267,12 +262,6 @@ def _follow_after(
     likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
     f.jumped = None
     return _After(f, sum(likelihoods), used, jumped)
-
-
-def lens_stepped(before: CalibrationFilter, after: CalibrationFilter, camera: str) -> Event:
-    """Return the event of a lens that jumped, with the difference of fx."""
-    focal = (f.state.cameras[camera].intrinsics[0] for f in (after, before))
-    return Event(EventKind.LENS_STEPPED, camera, float(np.subtract(*focal)))
 
 
 def _suspects(

@@ -302,16 +302,20 @@ class _Fit:
         self, e: FloatArray, J: FloatArray, Jt: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal equations with the directions eliminated, and each pair's share of the gradient."""
-        begin = self.pairs.begin
-        wJ, wJt = J * weight[:, None], Jt * weight[:, None]
-        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], begin) + 1e-9 * np.eye(2)
-        tx = np.add.reduceat(wJt[:, :, None] * J[:, None, :], begin)
-        te = np.add.reduceat(wJt * e[:, None], begin)
-        solved = np.linalg.solve(tt, np.concatenate([tx, te[..., None]], axis=2))
-        xt = np.swapaxes(tx, 1, 2)
+        tx, solved = self._directions(np.concatenate([J, e[:, None]], axis=1), Jt, weight)
+        wJ, xt = J * weight[:, None], np.swapaxes(tx[..., :-1], 1, 2)
         H = wJ.T @ J - (xt @ solved[..., :-1]).sum(axis=0)
-        each = np.add.reduceat(wJ * e[:, None], begin) - np.matmul(xt, solved[..., -1:])[..., 0]
+        each = np.add.reduceat(wJ * e[:, None], self.pairs.begin) - np.matmul(xt, solved[..., -1:])[..., 0]
         return H, each.sum(axis=0), each
+
+    def _directions(
+        self, columns: FloatArray, Jt: FloatArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Jt' W columns by pair, and the move of its direction that fits the columns best, (P, 2, p) each."""
+        wJt = Jt * weight[:, None]
+        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], self.pairs.begin) + 1e-9 * np.eye(2)
+        tx = np.add.reduceat(wJt[:, :, None] * columns[:, None, :], self.pairs.begin)
+        return tx, np.asarray(np.linalg.solve(tt, tx), np.float64)
 
     def _result(
         self, R: FloatArray, shift: float, bias: FloatArray, weight: FloatArray
@@ -462,8 +466,5 @@ class _Fit:
 
     def _without_direction(self, J: FloatArray, Jt: FloatArray, weight: FloatArray) -> FloatArray:
         """Derivatives by the shared unknowns with each pair's direction following along, shape (n, p)."""
-        begin, wJt = self.pairs.begin, Jt * weight[:, None]
-        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], begin) + 1e-9 * np.eye(2)
-        tx = np.add.reduceat(wJt[:, :, None] * J[:, None, :], begin)
-        out: FloatArray = J - np.einsum("ni,nik->nk", Jt, np.linalg.solve(tt, tx)[self.pairs.of])
-        return out
+        moved = self._directions(J, Jt, weight)[1]
+        return np.asarray(J - np.einsum("ni,nik->nk", Jt, moved[self.pairs.of]))

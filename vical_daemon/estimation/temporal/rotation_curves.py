@@ -14,31 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
 from vical_daemon.estimation.measurements import FloatArray
 
 _GAP = 2.5  # intervals longer than this many median intervals are holes in the data
 
 
-def cumulative_product(steps: FloatArray) -> FloatArray:
-    """Return all leading products of quaternions: 1, s0, s0 s1, s0 s1 s2 ...
-
-    A prefix scan: log2(m) batched products instead of m single ones.
-
-    Args:
-        steps: Unit quaternions, shape (m, 4).
-
-    Returns:
-        Unit quaternions, shape (m + 1, 4).
-    """
-    q = np.empty((len(steps) + 1, 4))
-    q[0] = 1.0, 0.0, 0.0, 0.0
-    q[1:] = steps
-    stride = 1
-    while stride < len(q):
-        q[stride:] = so3.quat_multiply(q[:-stride], q[stride:])
-        stride *= 2
-    q /= np.sqrt(np.vecdot(q, q))[:, None]
-    return q
+def running_integral(dt_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Integral of values over time up to each of them, by trapezoids; dt_s (m - 1,), values (m, ...)."""
+    out = np.zeros_like(values)
+    steps = dt_s.reshape(-1, *(1,) * (values.ndim - 1))
+    np.cumsum(0.5 * steps * (values[:-1] + values[1:]), axis=0, out=out[1:])
+    return out
 
 
 def _turn(rate: FloatArray, slope: FloatArray, s: FloatArray) -> FloatArray:
@@ -77,15 +64,12 @@ class GyroCurve:
         """
         rate = gyro_rps - bias_rps
         dt = np.diff(t_s)
-        slope = np.diff(rate, axis=0) / dt[:, None]
-        q = cumulative_product(so3.quat_from_rotvec(_turn(rate[:-1], slope, dt)))
-        R = so3.matrix_from_quat(q)
-        integral = np.zeros_like(R)
-        np.cumsum(0.5 * dt[:, None, None] * (R[:-1] + R[1:]), axis=0, out=integral[1:])
+        R = products(rotation_steps(rate[None], dt))[0]
+        integral = running_integral(dt, R)
         # in a hole the rate is unknown: it may have differed from the straight line by its own usual size
         hole = np.where(dt > _GAP * np.median(dt), dt, 0.0)
         extra = np.mean(np.vecdot(rate, rate)) / 3.0 * hole**2
-        return cls(t_s, rate, q, integral, np.concatenate(([0.0], np.cumsum(extra))))
+        return cls(t_s, rate, so3.quat_from_matrix(R), integral, np.concatenate(([0.0], np.cumsum(extra))))
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -122,9 +106,7 @@ class GyroCurve:
         """
         R = so3.matrix_from_quat(self.q_ref_imu)
         flow = (R[:, :, :, None] * self.rate_rps[:, None, None, :]).reshape(-1, 27)
-        dt = np.diff(self.t_s)[:, None]
-        total = np.zeros_like(flow)
-        np.cumsum(0.5 * dt * (flow[:-1] + flow[1:]), axis=0, out=total[1:])
+        total = running_integral(np.diff(self.t_s), flow)
         k, s, _ = self._segment(times_s)
         share = (s / (self.t_s[k + 1] - self.t_s[k]))[..., None]
         out: FloatArray = total[k] + share * (total[k + 1] - total[k])

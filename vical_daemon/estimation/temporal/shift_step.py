@@ -59,32 +59,6 @@ def level_at(curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, ti
     return max(float((e**2).sum()) / (e.size - 3), 1.0)
 
 
-def nearest_shift(
-    curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, present_s: float, most_s: float
-) -> float | None:
-    """The time shift within `most_s` of the present one at which orientations fit the gyro best, s.
-
-    To within a few ms, and whether or not they fit there; None where the curve does not reach.
-    """
-    found = _search(curve, seen, R_imu_cam, present_s, most_s)
-    return None if found is None else float(found[0][np.argmin(found[1])])
-
-
-def _search(
-    curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, present_s: float, most_s: float
-) -> tuple[FloatArray, FloatArray] | None:
-    """Time shifts on a grid, the present one last, and the sum of squares at each; None: not covered."""
-    t_cam_s = seen.t_cam_s
-    if len(t_cam_s) < _LEAST_IMAGES:
-        return None
-    low_s = max(present_s - most_s, curve.span_s[0] - float(t_cam_s[0]))
-    high_s = min(present_s + most_s, curve.span_s[1] - float(t_cam_s[-1]))
-    if not low_s <= present_s <= high_s:
-        return None
-    grid = np.append(np.arange(low_s, high_s, _GRID_S), present_s)
-    return grid, np.asarray((_errors(curve, seen, R_imu_cam, grid) ** 2).sum(axis=1))
-
-
 def find_shift(
     curve: RotationCurve,
     seen: Orientations,
@@ -106,10 +80,15 @@ def find_shift(
     Returns:
         The fit; None where none fits, more than one does, or the curve does not reach.
     """
-    found = _search(curve, seen, R_imu_cam, present_s, most_s)
-    if found is None:
+    t_cam_s = seen.t_cam_s
+    if len(t_cam_s) < _LEAST_IMAGES:
         return None
-    grid, cost = found
+    low_s = max(present_s - most_s, curve.span_s[0] - float(t_cam_s[0]))
+    high_s = min(present_s + most_s, curve.span_s[1] - float(t_cam_s[-1]))
+    if not low_s <= present_s <= high_s:
+        return None
+    grid = np.append(np.arange(low_s, high_s, _GRID_S), present_s)
+    cost = (_errors(curve, seen, R_imu_cam, grid) ** 2).sum(axis=1)
     shift_s = float(grid[np.argmin(cost)])
     for _ in range(_STEPS):
         at, ahead = _errors(curve, seen, R_imu_cam, np.array([shift_s, shift_s + _DERIVATIVE_S]))
@@ -121,7 +100,7 @@ def find_shift(
     if not grid.min() <= shift_s <= grid.max():
         return None
     best = float((_errors(curve, seen, R_imu_cam, np.array([shift_s])) ** 2).sum())
-    dof = 3 * len(seen.t_cam_s) - 4
+    dof = 3 * len(t_cam_s) - 4
     if best > usual_level * chi_square_limit(dof, SURE_SIGMAS):
         return None
     sure = best + LIKELY_SIGMAS**2 * usual_level

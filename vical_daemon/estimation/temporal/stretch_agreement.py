@@ -39,11 +39,21 @@ def widening(problem: DriftProblem, used: BoolArray, sensors: int) -> FloatArray
             continue
         p = 4 * sensors
         found.append((solution.x[:p], solution.covariance[:p, :p]))
-    out = np.ones((sensors, 2))
-    for i in range(sensors):
-        for j, part in enumerate((slice(4 * i, 4 * i + 3), slice(4 * i + 3, 4 * i + 4))):
-            out[i, j] = scatter_factor([x[part] for x, _ in found], [P[part, part] for _, P in found])
-    return out
+    return np.array([scatter_factors(found, 4 * i) for i in range(sensors)])
+
+
+def scatter_factors(found: Sequence[tuple[FloatArray, FloatArray]], first: int = 0) -> tuple[float, float]:
+    """Return `scatter_factor` of mounting and shift, the three parameters from `first` on and the next one.
+
+    Args:
+        found: Parameters of each stretch, shape (p,), and their covariance, shape (p, p).
+        first: Place of the mounting among them.
+    """
+    mounting, shift = (
+        scatter_factor([x[part] for x, _ in found], [P[part, part] for _, P in found])
+        for part in (slice(first, first + 3), slice(first + 3, first + 4))
+    )
+    return mounting, shift
 
 
 def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArray]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
-from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
+from vical_daemon.estimation.temporal.stretch_agreement import scatter_factors
 from vical_daemon.estimation.temporal.td_icp import ENOUGH_S, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
@@ -131,12 +131,7 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
     P = np.linalg.inv(information.sum(axis=0))
     mean = P @ np.einsum("kij,kj->i", information, offsets)
     stretches = [(o + x, C) for o, (_, f) in zip(offsets, fits, strict=True) for x, C in f.stretches]
-    widened = np.array(
-        [
-            scatter_factor([x[part] for x, _ in stretches], [C[part, part] for _, C in stretches])
-            for part in (slice(0, 3), slice(3, 4))
-        ]
-    )
+    widened = scatter_factors(stretches)
     P = P * np.outer(np.repeat(widened, (3, 1)), np.repeat(widened, (3, 1)))
     R = best.R_imu_cam @ so3.exp(mean[:3])
     covariance = np.zeros((7, 7))
@@ -158,5 +153,5 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
         rejected=n_frames - pairs,
         iterations=rounds,
         camera_noise_rad=float(np.median([f.error for _, f in fits])),
-        widened=float(widened.max()),
+        widened=max(widened),
     )

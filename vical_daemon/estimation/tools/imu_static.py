@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER
 from vical_daemon.estimation.temporal.orientation_problem import LEAST_NOISE_RAD
@@ -205,7 +206,7 @@ def calibrate_gyro(
     noise = _turn_noise(motions, rate_hz, accel)
 
     def residuals(x: FloatArray) -> FloatArray:
-        R_start_end = _product(so3.exp(padded @ x.reshape(3, 3).T / rate_hz))
+        R_start_end = products(so3.exp(padded @ x.reshape(3, 3).T / rate_hz))[:, -1]
         predicted = np.matvec(R_start_end.mT, before)
         return np.asarray(np.cross(predicted, after) / noise[:, None]).ravel()
 
@@ -275,18 +276,10 @@ def _padded_motions(gyro_rps: FloatArray, motions: list[tuple[Rest, Rest]]) -> F
     for a, b in motions:
         start, stop = (a.start + a.stop) // 2, (b.start + b.stop) // 2
         pieces.append(gyro_rps[start:stop] - 0.5 * (a.gyro_rps + b.gyro_rps))
-    length = 1 << (max(len(p) for p in pieces) - 1).bit_length()
-    padded = np.zeros((len(pieces), length, 3))
+    padded = np.zeros((len(pieces), max(len(p) for p in pieces), 3))
     for row, piece in zip(padded, pieces, strict=True):
         row[: len(piece)] = piece
     return padded
-
-
-def _product(R: FloatArray) -> FloatArray:
-    """Ordered product of rotations along axis 1 (a power of two long), shape (k, 3, 3)."""
-    while R.shape[1] > 1:
-        R = R[:, 0::2] @ R[:, 1::2]
-    return R[:, 0]
 
 
 def _turn_noise(motions: list[tuple[Rest, Rest]], rate_hz: float, accel: SensorCalibration) -> FloatArray:

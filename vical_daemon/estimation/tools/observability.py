@@ -22,6 +22,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import ROWS, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
+from vical_daemon.estimation.temporal.rotation_curves import running_integral
 
 IntArray = npt.NDArray[np.intp]
 
@@ -161,14 +162,6 @@ class Observability:
     units: FloatArray = field(repr=False, default_factory=lambda: np.ones(0))
 
 
-def _running(dt: FloatArray, values: FloatArray) -> FloatArray:
-    """Running integral over time (trapezoids) of values (m, ...)."""
-    out = np.zeros_like(values)
-    shape = (len(dt),) + (1,) * (values.ndim - 1)
-    np.cumsum(0.5 * dt.reshape(shape) * (values[:-1] + values[1:]), axis=0, out=out[1:])
-    return out
-
-
 def pose_sensitivities(
     motion: Motion, layout: dict[str, slice], p: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -183,10 +176,10 @@ def pose_sensitivities(
     eye = np.eye(3)
     theta = np.zeros((m, 3, p))
     theta[:, :, layout["attitude"]] = eye
-    theta[:, :, layout["gyro_bias"]] = -_running(dt, R)
+    theta[:, :, layout["gyro_bias"]] = -running_integral(dt, R)
     if "gyro_matrix" in layout:
         flow = (R[:, :, :, None] * w[:, None, None, :]).reshape(m, 3, 9)
-        theta[:, :, layout["gyro_matrix"]] = -_running(dt, flow)
+        theta[:, :, layout["gyro_matrix"]] = -running_integral(dt, flow)
     force = (R @ f[..., None])[..., 0]
     slope = -so3.hat(force) @ theta
     slope[:, :, layout["accel_bias"]] -= R
@@ -194,9 +187,9 @@ def pose_sensitivities(
     if "accel_matrix" in layout:
         rows, columns = np.tril_indices(3)
         slope[:, :, layout["accel_matrix"]] -= R[:, :, rows] * f[:, None, columns]
-    velocity = _running(dt, slope)
+    velocity = running_integral(dt, slope)
     velocity[:, :, layout["velocity"]] += eye
-    position = _running(dt, velocity)
+    position = running_integral(dt, velocity)
     position[:, :, layout["position"]] += eye
     return theta, velocity, position
 

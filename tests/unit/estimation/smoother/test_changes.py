@@ -15,7 +15,6 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.marginal_prior import CORE
-from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {
     EventKind.IMU_GAP,
@@ -184,26 +183,3 @@ def test_what_is_held_fixed_never_changed():
     layout = window_layout(fix=("extrinsics",), estimate=())
     found, covariance, prior = answers(np.random.default_rng(3), np.array([100.0]), layout)
     assert changed_blocks(found, covariance, prior, layout, excess) == clock(layout)
-
-
-class _Spin:
-    """A rate that changes about a fixed axis; only as much of a curve as is asked for."""
-
-    span_s = (0.0, 10.0)
-
-    def quaternion(self, t_s):
-        half = 0.5 * np.sin(2.0 * np.asarray(t_s) + 0.2 * np.asarray(t_s) ** 2)
-        zero = np.zeros_like(half)
-        return np.stack([np.cos(half), zero, np.sin(half), zero], axis=-1)
-
-
-@pytest.mark.parametrize("shift_s", [-0.8, 0.0, 0.5])
-def test_a_shift_is_found_wherever_it_stepped_to(shift_s):
-    t_s = np.linspace(4.0, 6.0, 40)
-    q = _Spin().quaternion(t_s + shift_s)
-    c, s = 1.0 - 2.0 * q[:, 2] ** 2, 2.0 * q[:, 0] * q[:, 2]
-    R = np.zeros((40, 3, 3))
-    R[:, 0, 0] = R[:, 2, 2] = c
-    R[:, 1, 1], R[:, 0, 2], R[:, 2, 0] = 1.0, s, -s
-    seen = Orientations(t_s, R, np.full(40, 1e-3))
-    assert nearest_shift(_Spin(), seen, np.eye(3), 0.0, 1.5) == pytest.approx(shift_s, abs=5e-3)

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from vical_mocks.points import board_points, simulate
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.delay_windows import delay_windows
-from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, cumulative_product
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
 from vical_daemon.estimation.temporal.track_orientations import relative_rotations, track_orientations
 
@@ -23,18 +23,7 @@ def _attitude(t, steps=8000):
     """Attitude at times t by brute force: many small steps."""
     fine = np.linspace(0.0, t[-1], steps + 1)
     dt = fine[1] - fine[0]
-    q = cumulative_product(so3.quat_from_rotvec(_rate(fine[:-1] + dt / 2) * dt))
-    return so3.matrix_from_quat(q)[np.round(t / dt).astype(int)]
-
-
-def test_prefix_products_are_products():
-    q = so3.quat_from_rotvec(np.random.default_rng(0).normal(0, 1, (13, 3)))
-    product = Rotation.identity()
-    for k, step in enumerate(np.roll(q, -1, axis=1)):
-        product = product * Rotation.from_quat(step)
-        np.testing.assert_allclose(
-            so3.matrix_from_quat(cumulative_product(q)[k + 1]), product.as_matrix(), atol=1e-14
-        )
+    return products(so3.exp(_rate(fine[:-1] + dt / 2) * dt)[None])[0, np.round(t / dt).astype(int)]
 
 
 def test_a_gyro_curve_follows_the_attitude_between_samples_and_predicts_what_a_bias_does():

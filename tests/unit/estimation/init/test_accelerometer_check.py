@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from vical_mocks.rig import reference_rig
 
-from vical_daemon.estimation.temporal.accelerometer_check import explain_accelerometer
+from vical_daemon.estimation.init.accelerometer_check import explain_accelerometer
 
 
 def data(seed: int, seconds: float = 20.0) -> tuple[np.ndarray, ...]:
