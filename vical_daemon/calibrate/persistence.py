@@ -62,6 +62,7 @@ class CalibrationPersistence:
         self._complete = threading.Event()
         self._before: dict[str, StoredCalibration] = {}
         self._compared: set[str] = set()
+        self._looked_up: set[str] = set()  # cameras for which a stored calibration was looked for
         self._saved_s = -float("inf")
         self.problem = ""  # why the last result could not be stored
         self._status: Status | None = None
@@ -83,18 +84,45 @@ class CalibrationPersistence:
             for sample in self._bus.latest(key):
                 self._listen(sample)
         self._complete.wait(wait_s)
-        known: dict[str, CameraPrior] = {}
+        self._looked_up.clear()
+        found = self.look_up()
+        return {name: self._prior(name, known=name in found) for name in self._config.calibration_cameras}
+
+    def look_up(self) -> list[str]:
+        """Look once for a stored calibration of each camera whose serial numbers are known by now.
+
+        A device may be opened long after the estimator started.
+
+        Returns:
+            Cameras for which one was found in this call; it is in `before` from now on.
+        """
+        found = []
         for name in self._config.calibration_cameras:
-            known[name] = given = camera_prior(self._config, name)
+            if name in self._looked_up or not all(self._pair(name)):
+                continue
+            self._looked_up.add(name)
             stored = self._load(name)
-            if stored is not None and stored.known.distortion_model == given.distortion_model:
+            if stored is None:
+                continue
+            was, now = stored.known.distortion_model, camera_prior(self._config, name).distortion_model
+            if was == now:
                 self._before[name] = stored
-                given_parts = {
-                    *self._config.calibration.fix,
-                    *(["intrinsics"] if stored.resized(given) else []),
-                }
-                known[name] = _merge(given, stored.prior(given.resolution), given_parts)
-        return known
+                found.append(name)
+            else:
+                _log.warning("%s: the stored calibration is %s, the config says %s: not used", name, was, now)
+        return found
+
+    def _prior(self, name: str, *, known: bool) -> CameraPrior:
+        given = camera_prior(self._config, name)
+        if not known:
+            return given
+        stored = self._before[name]
+        given_parts = set(self._config.calibration.fix)
+        if stored.resized(given):
+            given_parts.add("intrinsics")
+            was, now = ("{} x {}".format(*size) for size in (stored.known.resolution, given.resolution))
+            _log.warning("%s: the stored lens is for images of %s px, not %s: not used", name, was, now)
+        return _merge(given, stored.prior(given.resolution), given_parts)
 
     @property
     def replaced(self) -> bool:
@@ -155,6 +183,7 @@ class CalibrationPersistence:
         """
         events = list(estimate.events)
         if estimate.status is Status.CONVERGED:
+            self.look_up()  # before it is replaced
             events += self._changes(estimate)
             if self._status is not Status.CONVERGED:
                 notify.event("converged", f"{self._config.rig}: calibration converged", rig=self._config.rig)

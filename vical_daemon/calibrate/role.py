@@ -146,20 +146,32 @@ class _Supervisor:
         if self._restarts.waiting_s(now_s) > 0.0:
             self._discarded += sum(1 for _ in samples)
             return []
+        stored = self._look_up()
         try:
             for sample in samples:
                 self._role.take(sample)
             messages = self._role.step(now_s)
         except Exception as error:
             self._failed(_describe(error))
-            return []
+            return stored
         for event in self._role.news():
             self._persistence.announce(event)
             self.start_over()
         self._stuck_s = self._progress.look(self._role.images, self._role.settled, now_s)
         if self._stuck_s > 1.5 * STUCK_S:  # the status has reported it by then
             self._failed(f"images arrived and none was used or refused for {self._stuck_s:.0f} s")
-        return messages
+        return stored + messages
+
+    def _look_up(self) -> list[Message]:
+        """Look for what is stored for devices that were opened after this role began; return it if it is new.
+
+        The estimator starts again from it, if it has found nothing yet.
+        """
+        if not self._persistence.look_up():
+            return []
+        if self._role.latest is None or not self._role.latest.cameras:
+            self.start_over()
+        return self._persistence.stored_messages()
 
     def finish(self) -> list[Message]:
         """Process the rest of the data and return the last messages."""
@@ -174,7 +186,8 @@ class _Supervisor:
         self._stuck_s = 0.0
         self._checkpoint.forget()
         if estimator is None:
-            estimator = make_estimator(self._config, self._persistence.priors(wait_s=0.0))
+            priors = self._persistence.priors(wait_s=0.0)
+            estimator = _new_estimator(self._config, priors, self._persistence)
         self._role.reset(estimator)
 
     def _failed(self, why: str) -> None:

@@ -32,10 +32,14 @@ class _ClockSteps:
             if abs(step_s - self._announced_s) < CLOCK_STEP_S:
                 return
             self._announced_s = step_s
-        text = (
-            f"the system clock was set: it is {step_s:+.1f} s ahead of vical's stamps, "
-            "which keep the old time until the next boot"
-        )
+        if abs(step_s) < CLOCK_STEP_S:
+            text = "the system clock was set back: it agrees with vical's stamps again"
+        else:
+            side = "ahead of" if step_s > 0 else "behind"
+            text = (
+                f"the system clock was set: it is {abs(step_s):.1f} s {side} vical's stamps, "
+                "which keep the old time until the next boot"
+            )
         _log.warning("%s", text)
         notify.event("clock_set", text, level="warning", step_s=step_s)
 

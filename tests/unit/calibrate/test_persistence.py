@@ -7,6 +7,7 @@ import math
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from vical_daemon.calibrate.in_use import NothingInUseError, calibration_in_use
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.role import _Supervisor
 from vical_daemon.calibrate.worker import EstimateRole
-from vical_daemon.config.model import Config, VerifyConfig, loads
+from vical_daemon.config.model import Config, LensConfig, VerifyConfig, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.status.mounting_changes import differences
@@ -163,6 +164,42 @@ def test_serials_may_come_late_but_not_never(config: Config) -> None:
     persistence = CalibrationPersistence(config, bus, private_clock())
     threading.Timer(0.2, _announce, [bus]).start()
     assert persistence.priors()["cam0"].T_imu_cam is not None
+
+
+def test_what_is_stored_for_a_device_that_is_opened_late_is_compared_and_kept(config: Config) -> None:
+    """An IMU that takes long to open, or a camera plugged in later: the start does not wait for them."""
+    _remember(config, _camera())
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    assert persistence.priors(wait_s=0.0)["cam0"].T_imu_cam is None
+    assert persistence.look_up() == []
+    _announce(bus)
+    moved = persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03))))
+    assert [event.kind for event in moved.events] == [EventKind.CAMERA_MOVED]
+    assert persistence.look_up() == []  # what this run stored is not what was stored before
+    assert persistence.discard(moved) is not None
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is not None
+    np.testing.assert_array_equal(prior.T_imu_cam[1], [0.08, 0.02, -0.03])
+
+
+@pytest.mark.parametrize(
+    ("now", "said"),
+    [
+        ({"size": (320, 240)}, "the stored lens is for images of 640 x 480 px, not 320 x 240: not used"),
+        (
+            {"lens": LensConfig(distortion_model="equidistant")},
+            "the stored calibration is radtan, the config says equidistant: not used",
+        ),
+    ],
+)
+def test_what_is_stored_and_not_used_is_named(
+    config: Config, now: dict[str, Any], said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    _remember(config, replace(_camera(), resolution=[640, 480]))
+    changed = replace(config, cameras={"cam0": replace(config.cameras["cam0"], **now)})
+    _later(changed).priors()
+    assert [record.getMessage() for record in caplog.records] == [f"cam0: {said}"]
 
 
 def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config: Config) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -20,10 +21,13 @@ from vical_daemon.bus.messages import (
     encode_verification,
 )
 from vical_daemon.calibrate import role as estimate
+from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.cli import command
 from vical_daemon.cli.errors import CliError
 from vical_daemon.config.model import CameraConfig, Config, ImuConfig, StoreConfig
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.wording import event_text
+from vical_daemon.results.store import CalibrationStore
 from vical_daemon.service.wall_clock import private_clock
 
 
@@ -56,18 +60,23 @@ class Run:
 
 
 @pytest.fixture
-def running(tmp_path):
+def config(tmp_path):
     board = tmp_path / "board.yaml"
     board.write_text(
         "{target_type: checkerboard, targetCols: 8, targetRows: 6, "
         "rowSpacingMeters: 0.05, colSpacingMeters: 0.05}"
     )
-    config = Config(
+    return Config(
         imus={"imu0": ImuConfig(port="none")},
         cameras={"cam0": CameraConfig(uri="none")},
         target=str(board),
         store=StoreConfig(directory=str(tmp_path / "store")),
     )
+
+
+@pytest.fixture
+def running(config, monkeypatch):
+    monkeypatch.setattr(CalibrationPersistence.priors, "__defaults__", (0.0,))  # do not wait for devices
     bus, stop = LocalBus(), threading.Event()
     run = Run(bus)
     options = {"clock": private_clock()}
@@ -182,3 +191,25 @@ def test_commands_of_the_other_mode_are_refused_while_verifying(word):
     with contextlib.suppress(CliError):  # nobody answers here
         command.send(bus, "rig0", word, 0.05)
     assert commands.recv(0.0) is not None
+
+
+def test_a_device_that_is_opened_late_gets_what_is_stored_for_it(running, config):
+    """The role begins without serial numbers; it starts again from what is stored once they come."""
+    covariance = [[1e-8 * (i == j) for j in range(6)] for i in range(6)]
+    pose = PoseEstimate([0.08, 0.02, -0.03], [1.0, 0.0, 0.0, 0.0], covariance)
+    lens = ([500.0, 500.0, 320.0, 240.0], [1.0] * 4, "radtan", [0.1, 0.0, 0.0, 0.0], [0.01] * 4)
+    camera = CameraEstimate(pose, 0.01, 1e-5, *lens, 0.2)
+    known = CalibrationEstimate(
+        1, Status.CONVERGED, "", 1.0, "", 60.0, 600, 6000, {"cam0": camera}, None, [0.0] * 3, 1.0, 0.0
+    )
+    CalibrationStore(Path(config.store.directory)).save("I1", "C1", "cam0", known, 1)
+    stored = running.bus.subscribe(topics.STORED.key("rig0", "cam0"))
+    running.until(lambda: running.counts and running.counts[-1] > 100)
+    before = running.counts[-1]
+    for role, name, serial in (("imu", "imu/imu0", "I1"), ("camera", "camera/cam0", "C1")):
+        payload = encode_diagnostics(1, role, [DiagnosticStatus(Level.OK, name, "", serial)])
+        running.bus.publish(topics.STATUS.key("rig0", role), payload)
+    running.until(lambda: running.counts[-1] < before)
+    sample = stored.recv(1.0)
+    assert sample is not None
+    assert decode_calibration(sample.payload).estimate.cameras["cam0"].T_imu_cam.p_m == [0.08, 0.02, -0.03]

@@ -47,7 +47,7 @@ def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.Monkey
     monkeypatch.setattr(health, "_clock_steps", health._ClockSteps())
     clock, bus = private_clock(), LocalBus()
     senders = [health.StatusSender("rig0", role, bus, clock) for role in ("imu", "camera", "record")]
-    for offset_s in (0.0, 0.004, 3600.0, 3600.0, 0.0, 0.0):
+    for offset_s in (0.0, 0.004, 3600.0, 3600.0, 0.0, 0.0, -1.0):
         monkeypatch.setattr(
             wall_clock, "measure_offset_ns", lambda s=offset_s: clock.offset_ns + round(1e9 * s)
         )
@@ -55,6 +55,7 @@ def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.Monkey
             sender.tick(list, force=True)
     tail = "which keep the old time until the next boot"
     assert events == [
-        f"clock_set: the system clock was set: it is {step} s ahead of vical's stamps, {tail}"
-        for step in ("+3600.0", "+0.0")
+        f"clock_set: the system clock was set: it is 3600.0 s ahead of vical's stamps, {tail}",
+        "clock_set: the system clock was set back: it agrees with vical's stamps again",
+        f"clock_set: the system clock was set: it is 1.0 s behind vical's stamps, {tail}",
     ]

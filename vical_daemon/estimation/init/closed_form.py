@@ -28,6 +28,7 @@ from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, lo
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
+from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -97,20 +98,17 @@ def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
 def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
     """A start with everything known, or the reason why not."""
     rough: dict[str, RotationsKnown] = {}
-    for name, (lens, _, poses) in seen.items():
+    for name, (lens, frames, poses) in seen.items():
         if len(poses) < MIN_ORIENTATIONS:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
-        found = _timing(data.buffer, poses, lens)
-        long = poses[-1].t_cam_s - poses[0].t_cam_s > LONG_S
-        why = found.reason or not_sure_yet(
-            found.timeshift_sigma_s,
-            float(np.max(found.rotation_sigma_rad)),
-            (2.0 if long else 1.0) * SHIFT_SIGMA_S,
-            ROTATION_SIGMA_RAD,
-        )
+        found, why = _timing(data.buffer, poses, lens)
         if why:
+            held = not data.layout.lens_free(name)
+            other = other_lens(frames, lens, data.target) if held else None
+            if other is not None and _starts(data, frames, other):
+                return StartResult(None, f"{name}: {blamed(lens, other)}")
             return StartResult(None, f"{name}: {why}", motion_missing=True)
         camera = camera_by_rotations(
             lens, data.priors[name], data.options.fix, found.R_imu_cam, found.timeshift_cam_imu_s
@@ -195,12 +193,26 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
     return Seen(lens, frames, [] if axis else usable_poses(frames, lens, target)), axis
 
 
-def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> TdIcpResult:
+def _starts(data: StartData, frames: Frames, lens: CameraState) -> bool:
+    """Whether rotations would be enough for a start if a camera had this lens."""
+    poses = usable_poses(frames, lens, data.target)
+    return len(poses) >= MIN_ORIENTATIONS and not _timing(data.buffer, poses, lens)[1]
+
+
+def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> tuple[TdIcpResult, str]:
+    """What rotations show, and why that is not enough for a start, in words; empty: it is."""
     rows = buffer.rows
-    return td_icp(
+    found = td_icp(
         rows[:, 0],
         rows[:, 1:4],
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
         attitude_sigmas(poses, lens),
+    )
+    long = poses[-1].t_cam_s - poses[0].t_cam_s > LONG_S
+    return found, found.reason or not_sure_yet(
+        found.timeshift_sigma_s,
+        float(np.max(found.rotation_sigma_rad)),
+        (2.0 if long else 1.0) * SHIFT_SIGMA_S,
+        ROTATION_SIGMA_RAD,
     )

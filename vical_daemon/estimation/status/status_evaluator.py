@@ -280,7 +280,13 @@ class StatusEvaluator(Evaluator):
         return lacking_verdict(lacking, shown_s=f.state.t_s - since_s)
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
-        """The camera whose fixed lens is the only reason why something is missing; empty: there is none."""
+        """The camera whose fixed lens is why something is missing; empty: there is none.
+
+        It is if images contradict it, whatever the motion shows, or if nothing is missing but for its errors.
+        """
+        off = [name for name in missing if missing[name] and model_mixture.lens_block(name) in f.off]
+        if off:
+            return max(off, key=lambda n: max(m.excess for m in missing[n]))
         cameras = {name: lens_known(self._camera(name, f)) for name in _seen(f) if name in f.layout.held}
         if not cameras or any(self._missing(e, name, f) for name, e in cameras.items()):
             return ""
