@@ -7,7 +7,6 @@ short lag (so that inertial data always bracket each image) -> `evaluator` says 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from copy import deepcopy
 
 import numpy as np
 
@@ -39,7 +38,7 @@ from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch, suspect
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
-from vical_daemon.estimation.status.pending_change import PendingChange
+from vical_daemon.estimation.status.pending_change import Known, PendingChange
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, what_jumped
@@ -368,8 +367,8 @@ class Calibrator:
             fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera, stepped=stepped)
-        known = deepcopy(before.state.cameras)
-        self._change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, known).after(self._change)
+        change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, Known.of(before))
+        self._change = change.after(self._change)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
@@ -384,8 +383,7 @@ class Calibrator:
         if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):
             return False
         part, possible, f, known = found
-        cameras = known.state.cameras
-        change = PendingChange(part, possible, camera, f.state.t_s, cameras).after(self._change)
+        change = PendingChange(part, possible, camera, f.state.t_s, Known.of(known)).after(self._change)
         change.tell(f, before, self.evaluator, self.watch.why)
         self.filter, self._change = f, change
         self._past.changed(f)

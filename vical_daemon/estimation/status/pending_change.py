@@ -2,19 +2,49 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.selection import clock_drift
+from vical_daemon.estimation.significance import LIKELY_SIGMAS
 from vical_daemon.estimation.status.mounting_changes import IRRELEVANT_PX, IRRELEVANT_S
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import MOVED, Part
+
+
+class Known(NamedTuple):
+    """What is known of a camera that may step.
+
+    Attributes:
+        intrinsics: fx fy cx cy, px, shape (4,).
+        intrinsics_sigma: As reported, but for what stretches disagree, px, shape (4,); zeros: not estimated.
+        timeshift_s: Time shift, s.
+        timeshift_sigma_s: As reported, s.
+    """
+
+    intrinsics: FloatArray
+    intrinsics_sigma: FloatArray
+    timeshift_s: float
+    timeshift_sigma_s: float
+
+    @classmethod
+    def of(cls, f: CalibrationFilter) -> dict[str, Known]:
+        """As a filter knows its cameras."""
+        out, sigmas = {}, f.sigmas()
+        for name, camera in f.state.cameras.items():
+            where, spread = f.layout.cameras[name], math.sqrt(f.consistency[name].factor)
+            lens = np.zeros(4) if where.intrinsics is None else spread * sigmas[where.intrinsics]
+            shift_s = 0.0 if where.timeshift is None else spread * float(sigmas[where.timeshift])
+            out[name] = cls(camera.intrinsics.copy(), lens, camera.timeshift_s, shift_s)
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +63,7 @@ class PendingChange:
     possible: frozenset[Part]
     camera: str
     at_s: float
-    before: Mapping[str, CameraState]
+    before: Mapping[str, Known]
 
     def confirmed(self, t_s: float) -> bool:
         """Whether images have not contradicted it for long enough."""
@@ -73,14 +103,16 @@ class PendingChange:
     def news(self, f: CalibrationFilter) -> Event | None:
         """What is to be announced of a change that is confirmed, of filter `f`, and was not announced yet.
 
-        Nothing if all is as it was before: images were wrong for a while.
+        Nothing if all is as it was before, within what both leave open: images were wrong for a while.
         """
-        now, before = f.state.cameras[self.camera], self.before[self.camera]
+        now, before = Known.of(f)[self.camera], self.before[self.camera]
         step_s = now.timeshift_s - before.timeshift_s
-        if self.shift_stepped and abs(step_s) > IRRELEVANT_S:
+        open_s = LIKELY_SIGMAS * math.hypot(now.timeshift_sigma_s, before.timeshift_sigma_s)
+        if self.shift_stepped and abs(step_s) > max(open_s, IRRELEVANT_S):
             return Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s)
-        step_px = float(np.abs(now.intrinsics - before.intrinsics).max())
-        if self.part is Part.LENS and not self.moved and step_px > IRRELEVANT_PX:
-            focal_px = float(now.intrinsics[0] - before.intrinsics[0])
-            return Event(EventKind.LENS_STEPPED, self.camera, focal_px)
+        step_px = now.intrinsics - before.intrinsics
+        open_px = LIKELY_SIGMAS * np.hypot(now.intrinsics_sigma, before.intrinsics_sigma)
+        stepped = np.abs(step_px) > np.maximum(open_px, IRRELEVANT_PX)
+        if self.part is Part.LENS and not self.moved and stepped.any():
+            return Event(EventKind.LENS_STEPPED, self.camera, float(step_px[0]))
         return None

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from vical_mocks.points import simulate
 
+from tests.unit.estimation.some_filter import some_filter
 from tests.unit.estimation.test_calibrator import calibrate, errors
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
 from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.status.pending_change import Known, PendingChange
+from vical_daemon.estimation.status.what_jumped import Part
 
 WRONG = 10  # images, half a second
 
@@ -30,3 +34,28 @@ def test_nothing_has_changed_where_images_fit_again_after_a_while(fix):
     assert events == []
     x, sigma = errors(estimate, true)
     assert estimate.status == Status.CONVERGED and np.abs(x / sigma).max() < 3.5
+
+
+@pytest.mark.parametrize(
+    ("part", "kind", "step", "sigma"),
+    [(Part.LENS, EventKind.LENS_STEPPED, 1.5, 0.5), (Part.SHIFT, EventKind.TIMESHIFT_STEPPED, 5e-4, 2e-4)],
+)
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_step_is_announced_if_it_exceeds_what_is_left_open(part, kind, step, sigma, certain):
+    """On EuRoC a lens was announced to have stepped by 0.7 px, with 0.8 and 0.5 px of sigma before and after."""
+    f = some_filter()[0]
+    where, lens = f.layout.cameras["cam0"], part is Part.LENS
+    rows = [*range(where.intrinsics.start, where.intrinsics.stop)] if lens else [where.timeshift]
+    for row in rows:
+        f.forget(row, sigma / 5.0 if certain else sigma)
+    known = Known.of(f)
+    change = PendingChange(part, frozenset({part}), "cam0", 0.0, known)
+    if lens:
+        f.state.cameras["cam0"].intrinsics[0] += step
+    else:
+        f.state.cameras["cam0"].timeshift_s += step
+    event = change.news(f)
+    if certain:
+        assert (event.kind, event.value) == (kind, pytest.approx(step))
+    else:
+        assert event is None
