@@ -379,7 +379,7 @@ class Calibrator:
             fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
             return self._part_jumped(before, camera, stepped=stepped)
-        change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, before, self._past.since(before))
+        change = PendingChange(Part.SHIFT, frozenset(), camera, f.state.t_s, before, self._past.images())
         self._change = change.after(self._change)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
@@ -391,11 +391,11 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        images = self._past.since(before)
-        part, possible, f, known, at = what_jumped(before, images, camera, self._step)
+        part, possible, f, known, at = what_jumped(before, self._past.since(), camera, self._step)
         if part is Part.NONE or (stepped and part in (Part.SHIFT, Part.DRIFT)):
             return False
-        change = PendingChange(part, possible, camera, f.state.t_s, known, images[at:]).after(self._change)
+        images = self._past.images()[at:]
+        change = PendingChange(part, possible, camera, f.state.t_s, known, images).after(self._change)
         change.tell(f, before, self.evaluator, self.watch.why)
         self.filter, self._change = f, change
         self._past.changed(f)
