@@ -379,7 +379,7 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        found = what_jumped(before, self._past.since(before), camera, self._step)
+        found = what_jumped(before, self._past.since(), camera, self._step)
         if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):
             return False
         part, possible, f, known = found

@@ -23,8 +23,9 @@ from vical_daemon.estimation.filter.image_update import (
     log_likelihood,
     rows_of,
     solve,
+    whitened,
 )
-from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
+from vical_daemon.estimation.filter.jump_scores import Corrected, JumpSizes, Moved
 from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
@@ -93,8 +94,8 @@ class CalibrationFilter:
         arm_score: Bias of lever arms and size by noise; None: no image yet, or the motion was lost.
         arm_scores: What it has given so far, 1/m and 1, shape (3 cameras + 1,); 0: nothing yet.
         by_clipping: See `Influence`, of the latest segment.
-        jumps: Asked for while something has changed, and nobody knows what.
-        jumped: Likewise, of a copy that knows of a jump.
+        jumped: Of a copy that knows of a jump.
+        passed: What was done since this was emptied last (see `RecentPast`).
     """
 
     state: State
@@ -118,8 +119,8 @@ class CalibrationFilter:
     arm_score: LeverArmScore | None = None
     arm_scores: FloatArray | float = 0.0
     by_clipping: FloatArray | None = None
-    jumps: JumpScores | None = None
     jumped: JumpSizes | None = None
+    passed: list[Moved | Corrected] = field(default_factory=list)
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -132,10 +133,10 @@ class CalibrationFilter:
         state = self.state
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
-        for jumps in (self.jumps, self.jumped):
-            if jumps is not None:
-                jumps.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
-                self._drift(jumps.D, jumps.D, moved.seconds)
+        if self.jumped is not None:
+            d = self.layout.dynamic
+            self.jumped.predict(moved.linear, self.S[:d, :d])
+            self._drift(self.jumped.D, self.jumped.D, moved.seconds)
         self._grow(moved, Q)
         self._predict_score(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
@@ -189,7 +190,8 @@ class CalibrationFilter:
         noise = self._random_walk(moved.seconds, after=c + 9)
         noise[:9, :c] = moved.curved
         noise[:9, c : c + 9] = unscented.root(Q)
-        self.S = unscented.lower_root_grown(A, noise, d)
+        before, self.S = self.S, unscented.lower_root_grown(A, noise, d)
+        self.passed.append(Moved(before, self.S, moved.linear, moved.seconds))
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -214,7 +216,10 @@ class CalibrationFilter:
         noise_updates.learn(self, image, lin, fit)
         score = self._arm_score(image, lin, fit)
         self.arm_scores = self.arm_scores + score
+        before = self.S
         self._accept(fit.S, fit.dx + self._step_by(score, fit.S))
+        rows = whitened(image, lin, fit) if lin.curved.size else (fit.ways, fit.r)
+        self.passed.append(Corrected(before, self.S, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
@@ -414,7 +419,8 @@ class CalibrationFilter:
         self._drift_shifts(A, dt)
         A[:new] = 0.0
         A[:new, -new:] = np.diag(sigmas)
-        self.S = unscented.lower_root(A)
+        before, self.S = self.S, unscented.lower_root(A)
+        self.passed.append(Moved(before, self.S, np.zeros((9, self.layout.dynamic)), dt))
         self.arm_score = None
         state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
@@ -456,6 +462,7 @@ class CalibrationFilter:
             state=deepcopy(self.state),
             S=self.S.copy(),
             arm_score=deepcopy(self.arm_score),
+            passed=[],
             _motion_straight=LinearityMonitor() if earlier is None else earlier._motion_straight,
             _view_straight={} if earlier is None else earlier._view_straight,
         )

@@ -2,14 +2,17 @@
 
 A filter that does not know that some errors jumped by nu just before image k sees innovations of the mean
 H_t D_t nu. D begins with one column for each direction of the jump, is propagated from image to image, and is
-reduced by each correction. So one run gives, for each k, the information about nu in the innovations.
+reduced by each correction. All these steps are linear. So what the filter did is gone through once, backwards
+(as in a smoother), for the information about any error before each image; D then picks the directions.
 [Willsky and Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in
-linear systems", 1976]
+linear systems", 1976; Bryson and Frazier, "Smoothing for linear and nonlinear dynamic systems", 1963]
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -36,76 +39,86 @@ def _likelihoods(A: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (explained - np.linalg.slogdet(inner)[1]))
 
 
-@dataclass(slots=True)
-class JumpScores:
+class Moved(NamedTuple):
+    """How a filter was propagated.
+
+    Attributes:
+        before: Square root of the covariance before, shape (n, n).
+        after: Square root of the covariance afterwards, shape (n, n).
+        linear: F `before` of the motion by the dynamic errors, shape (9, d).
+        seconds: For how long.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    linear: FloatArray
+    seconds: float
+
+
+class Corrected(NamedTuple):
+    """How a filter was corrected by an image.
+
+    Attributes:
+        before: Square root of the covariance as predicted, shape (n, n).
+        after: Likewise, of the corrected state.
+        ways: The whitened corners by the ways in which the image can move, shape (m, w).
+        innovation: Theirs, shape (m,).
+        moves: Square root of how far the state, and then what corners share, move the image: (w, c).
+    """
+
+    before: FloatArray
+    after: FloatArray
+    ways: FloatArray
+    innovation: FloatArray
+    moves: FloatArray
+
+
+class JumpScores(NamedTuple):
     """What the images of a run say about jumps just before each of them.
 
     Jumps are over one sigma of theirs, so that the prior of each is a unit normal distribution.
 
     Attributes:
-        D: Errors now, after a jump of one sigma, by its instant and direction, shape (n, k p).
         information: A of the jump before each of k images, shape (k, p, p).
         weighted: Information vector b, whose mean is A times the jump, shape (k, p).
     """
 
-    D: FloatArray
     information: FloatArray
     weighted: FloatArray
 
     @classmethod
-    def of(cls, size: int, p: int) -> JumpScores:
-        """Return empty scores for a filter with `size` errors, and jumps in `p` directions."""
-        return cls(np.zeros((size, 0)), np.zeros((0, p, p)), np.zeros((0, p)))
+    def of(
+        cls,
+        run: Sequence[Sequence[Moved | Corrected]],
+        columns: Sequence[FloatArray],
+        drifts: Sequence[tuple[int, int]],
+    ) -> JumpScores:
+        """Go back through a run once: what images say about the errors at an instant holds for any jump.
 
-    def begin(self, columns: FloatArray) -> None:
-        """The next image may be the first after a jump.
-
-        Args:
-            columns: Directions of the errors, each as long as one sigma of a jump, shape (n, p).
-        """
-        p = columns.shape[1]
-        self.D = np.concatenate([self.D, columns], axis=1)
-        self.information = np.concatenate([self.information, np.zeros((1, p, p))])
-        self.weighted = np.concatenate([self.weighted, np.zeros((1, p))])
-
-    def predict(self, linear: FloatArray, S: FloatArray) -> None:
-        """Propagate.
+        Errors are counted in columns of the square root of the covariance. In these units nothing is large,
+        and what images say is only added up.
 
         Args:
-            linear: F S of the motion by the dynamic errors, shape (9, d).
-            S: Square root of their covariance before, shape (d, d).
+            run: What each image did to the filter.
+            columns: Directions of the errors before that, each as long as one sigma of a jump, (n, p).
+            drifts: Where errors of a time shift and of its rate are.
         """
-        self.D[:9] = linear @ solve_lower(S, self.D[: len(S)])
-
-    def update(
-        self,
-        rows: tuple[FloatArray, FloatArray],
-        by_error: FloatArray,
-        moves: FloatArray,
-        S: FloatArray,
-    ) -> None:
-        """Take an image, with the covariance as predicted.
-
-        Args:
-            rows: The whitened corners by the ways in which the image can move, shape (m, w), and their
-                innovation, shape (m,).
-            by_error: The ways by the errors, shape (w, n).
-            moves: Square root of how far the state, and then what corners share, move the image: (w, c).
-            S: Square root of the covariance, shape (n, n).
-        """
-        ways, innovation = rows
-        N = ways.T @ ways
-        inner = np.linalg.solve(
-            unit(len(N)) + N @ (moves @ moves.T), np.concatenate([N, (ways.T @ innovation)[:, None]], axis=1)
-        )
-        J, j = inner[:, :-1], inner[:, -1]  # W' V^-1 W and W' V^-1 r, V = 1 + W moves moves' W'
-        G = by_error @ self.D
-        k, p = self.weighted.shape
-        JG = J @ G
-        self.weighted += (j @ G).reshape(k, p)
-        by_instant = np.swapaxes(G.reshape(len(G), k, p), 0, 1)
-        self.information += np.swapaxes(by_instant, 1, 2) @ np.swapaxes(JG.reshape(len(G), k, p), 0, 1)
-        self.D -= S @ (moves[:, : len(S)].T @ JG)
+        n, p = columns[0].shape
+        A, b, root = np.zeros((n, n)), np.zeros(n), unit(n)
+        information, weighted = np.zeros((len(run), p, p)), np.zeros((len(run), p))
+        for k in range(len(run) - 1, -1, -1):
+            for done in reversed(run[k]):
+                if done.after is not root:  # an error was reopened
+                    A, b = _before(A, b, solve_lower(root, done.after))
+                A, b = _before(A, b, _by_step(done, drifts))
+                if isinstance(done, Corrected):
+                    J, j = _said(done)
+                    spread = done.moves[:, :n]
+                    A, b = A + spread.T @ J @ spread, b + j @ spread
+                root = done.before
+            D = solve_lower(root, columns[k])
+            information[k], weighted[k] = D.T @ A @ D, b @ D
+        return cls(information, weighted)
 
     def log_ratios(self, part: slice) -> FloatArray:
         """Logarithm of the likelihood of a jump of any size in some directions over that of none, shape (k,).
@@ -115,6 +128,31 @@ class JumpScores:
         """
         each = _likelihoods(self.information[:, part, part], self.weighted[:, part])
         return np.asarray(logsumexp(each, axis=-1) - np.log(len(SIZES)))
+
+
+def _before(A: FloatArray, b: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What is said about the errors before a step, from what is said about those after it."""
+    return step.T @ A @ step, b @ step
+
+
+def _by_step(done: Moved | Corrected, drifts: Sequence[tuple[int, int]]) -> FloatArray:
+    """Errors after a step by those before it, in columns of the roots, shape (n, n)."""
+    if isinstance(done, Corrected):
+        return np.asarray(solve_lower(done.before, done.after).T)  # 1 - K H = P+ P^-1
+    carried = done.before.copy()
+    carried[:9, : done.linear.shape[1]] = done.linear
+    for shift, rate in drifts:
+        carried[shift] += done.seconds * done.before[rate]
+    return solve_lower(done.after, carried)
+
+
+def _said(image: Corrected) -> tuple[FloatArray, FloatArray]:
+    """W' V^-1 W and W' V^-1 r, V = 1 + W moves moves' W', shapes (w, w) and (w,)."""
+    ways, moves = image.ways, image.moves
+    N = ways.T @ ways
+    weighted = np.concatenate([N, (ways.T @ image.innovation)[:, None]], axis=1)
+    inner = np.linalg.solve(unit(len(N)) + N @ (moves @ moves.T), weighted)
+    return inner[:, :-1], inner[:, -1]
 
 
 @dataclass(slots=True)
@@ -141,7 +179,12 @@ class JumpSizes:
         return cls(columns.copy(), np.zeros(p), np.eye(p))
 
     def predict(self, linear: FloatArray, S: FloatArray) -> None:
-        """Propagate; arguments as for `JumpScores`."""
+        """Propagate.
+
+        Args:
+            linear: F S of the motion by the dynamic errors, shape (9, d).
+            S: Square root of their covariance before, shape (d, d).
+        """
         self.D[:9] = linear @ solve_lower(S, self.D[: len(S)])
 
     def correct(self, before: FloatArray, after: FloatArray, dx: FloatArray) -> None:

@@ -19,7 +19,7 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     """Take what an image says about shared errors, lens and jumps.
 
     Args:
-        f: The filter, still as predicted; its `shared`, `agreement`, `jumps` and `jumped` learn.
+        f: The filter, still as predicted; its `shared`, `agreement` and `jumped` learn.
         image: The image.
         lin: The image about the prediction.
         fit: Its correction, not yet accepted.
@@ -27,8 +27,6 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     where = f.layout.cameras[image.camera]
     # a fit far from straight is linearised elsewhere
     rows = whitened(image, lin, fit) if lin.curved.size else fit.rows
-    if f.jumps is not None:
-        f.jumps.update(rows, lin.by_error, lin.moves, f.S)
     if f.jumped is not None:
         f.jumped.correct(f.S, fit.S, fit.dx)
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)

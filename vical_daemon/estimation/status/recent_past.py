@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
+from vical_daemon.estimation.filter.jump_scores import Corrected, Moved
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import attitude_sigmas, poses_of
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import (
@@ -31,29 +35,60 @@ _BEFORE_IMAGES = 30  # that show how well orientations usually fit
 _MOST = 200  # images kept, a camera
 
 
+class Taken(NamedTuple):
+    """An image that the filter has taken.
+
+    Attributes:
+        image: Its stamp, s, and points.
+        used: Whether it was used.
+        log_likelihood: See `FrameReport`.
+        state: After it.
+        passed: What it did to the filter.
+    """
+
+    image: tuple[float, PointsFrame]
+    used: bool
+    log_likelihood: float
+    state: State
+    passed: Sequence[Moved | Corrected]
+
+
+class _Copy(NamedTuple):
+    """A copy of the filter, and the images that the filter has taken since, of all cameras, in order."""
+
+    filter: CalibrationFilter
+    since: list[Taken]
+
+
 @dataclass(slots=True)
 class RecentPast:
     """Images of the last seconds by camera, and copies of the filter from before."""
 
     _frames: dict[str, deque[tuple[float, PointsFrame, bool]]] = field(default_factory=dict)
-    _copies: deque[CalibrationFilter] = field(default_factory=deque)
+    _copies: deque[_Copy] = field(default_factory=deque)
 
     def saw(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
         """Remember an image, whether it was used, and once a second the filter."""
         frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
         frames.append((t_cam_s, frame, report.used))
-        while self._copies and self._copies[0].state.t_s < f.state.t_s - BEFORE_S - EVERY_S:
+        likelihood, passed = report.log_likelihood, tuple(f.passed)
+        taken = Taken((t_cam_s, frame), report.used, likelihood, replace(f.state), passed)
+        f.passed.clear()
+        for copy in self._copies:
+            copy.since.append(taken)
+        while self._copies and self._copies[0].filter.state.t_s < f.state.t_s - BEFORE_S - EVERY_S:
             self._copies.popleft()
-        if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + EVERY_S:
-            self._copies.append(deepcopy(f))
+        if not self._copies or f.state.t_s >= self._copies[-1].filter.state.t_s + EVERY_S:
+            self._copies.append(_Copy(deepcopy(f), []))
 
     def changed(self, f: CalibrationFilter) -> None:
         """Go on with another filter: copies from before know of no change."""
-        self._copies = deque([deepcopy(f)])
+        f.passed.clear()
+        self._copies = deque([_Copy(deepcopy(f), [])])
 
     def filter(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter as it was before a change that is noticed now, or as long ago as it is remembered."""
-        return deepcopy(self._copies[0] if self._copies else f)
+        return deepcopy(self._copies[0].filter if self._copies else f)
 
     def find_shift(
         self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray
@@ -71,17 +106,13 @@ class RecentPast:
                 return fit
         return None
 
-    def since(self, f: CalibrationFilter) -> Frames:
-        """Images that `f`, a filter from before, has not taken yet: stamps, s, and points, oldest first."""
-        shifts_s = {name: f.state.cameras[name].timeshift_s for name in self._frames}
-        newer = [
-            (t + shifts_s[name], t, frame)
-            for name, frames in self._frames.items()
-            for t, frame, _ in frames
-            if t + shifts_s[name] > f.state.t_s
-        ]
-        newer.sort(key=lambda x: x[0])
-        return [(t, frame) for _, t, frame in newer]
+    def since(self) -> list[Taken]:
+        """Images that `filter` has not taken yet, of all cameras, in order."""
+        return list(self._copies[0].since) if self._copies else []
+
+    def images(self) -> Frames:
+        """These images alone: stamps, s, and points."""
+        return [taken.image for taken in self.since()]
 
     def before_step(
         self, f: CalibrationFilter, fit: ShiftFit, camera: str, buffer: ImuBuffer, target: FloatArray
@@ -98,7 +129,7 @@ class RecentPast:
         Returns:
             Stamps, s, and points, of all cameras, oldest first.
         """
-        newer = self.since(f)
+        newer = self.images()
         own = [(t, frame) for t, frame in newer if frame.camera == camera]
         seen = _orientations(own, f, target)
         if seen is None or len(buffer) < 2:

@@ -1,10 +1,10 @@
 """What has changed when images no longer fit: the part of the calibration that explains them if it jumped.
 
-A filter from before the change follows the images once more. `JumpScores` give the most likely instants of a
-jump of each part. Copies of the filter follow the images again, one for each part and instant, with that part
-unknown from there on. The part under which the images are most likely is the one that jumped, if they are
-more likely than without a jump. Parts that explain them nearly as well may have jumped, too: the filter goes
-on with all of these unknown. [docs/math/filter.md, "Detection of changes"]
+`JumpScores` give the most likely instants of a jump of each part, from what the images of the last seconds
+did to the filter. Copies of a filter from before follow these images again, one for each part and instant,
+with that part unknown from there on. The part under which the images are most likely is the one that jumped,
+if they are more likely than without a jump. Parts that explain them nearly as well may have jumped, too: the
+filter goes on with all of these unknown. [docs/math/filter.md, "Detection of changes"]
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import SKEW_SIGMA
 from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, VELOCITY, Layout, State
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.status.recent_past import Taken
 
 _SHIFT_S = 5e-3
 """One sigma of the largest step of the time shift, s (smaller ones: `jump_scores.SIZES`); orientations of
@@ -73,12 +74,12 @@ _NOT_BESIDE = (
 """Parts that are not considered where one of others is possible, in this order."""
 
 
-def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
+def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
     """Parts that may jump: directions of the errors, each as long as one sigma of the jump, shape (n, q).
 
     Those of a knock are the time shift's and, next to them, the mounting's.
     """
-    layout, out = f.layout, {}
+    out = {}
     where, every = layout.cameras[camera], range(layout.size)
     if where.skew is not None:
         out[Part.DRIFT] = _columns(layout.size, [where.skew], [SKEW_SIGMA])
@@ -93,15 +94,15 @@ def _jumps(f: CalibrationFilter, camera: str) -> dict[Part, FloatArray]:
     if camera in mountings:
         out[Part.MOUNTING] = _columns(layout.size, mountings[camera], sigmas)
     if where.intrinsics is not None:  # of a fixed lens, too: its errors are considered
-        focal = float(f.state.cameras[camera].intrinsics[0])
+        focal = float(state.cameras[camera].intrinsics[0])
         out[Part.LENS] = _columns(
             layout.size, every[where.intrinsics], focal * np.repeat([_ZOOM, _SHIFTED], 2)
         )
     if len(mountings) > 1:
         errors = [k for own in mountings.values() for k in own]
         out[Part.MOUNTINGS] = _columns(layout.size, errors, np.tile(sigmas, len(mountings)))
-        out[Part.IMU] = _imu_moves(f.state, layout)
-    out[Part.TARGET] = _target_moves(f.state, layout.size)
+        out[Part.IMU] = _imu_moves(state, layout)
+    out[Part.TARGET] = _target_moves(state, layout.size)
     return out
 
 
@@ -153,20 +154,25 @@ class Found(NamedTuple):
     before: CalibrationFilter
 
 
-def what_jumped(before: CalibrationFilter, images: Frames, camera: str, step: Step) -> Found | None:
+def what_jumped(before: CalibrationFilter, taken: Sequence[Taken], camera: str, step: Step) -> Found | None:
     """Find which part of the calibration of a camera jumped, or whether the target did.
 
     Args:
         before: The filter from before the change; it is not modified.
-        images: Since then, of all cameras, in order.
+        taken: Images since then, of all cameras, in order.
         camera: The one whose images do not fit.
         step: Takes an image with a filter.
 
     Returns:
         None where no jump explains the images.
     """
+    if not taken:
+        return None
+    images = [x.image for x in taken]
     odds = _ODDS * before.consistency[camera].strictness
-    none, refused, instants = _suspects(before, images, camera, step, odds)
+    none = sum(x.log_likelihood for x in taken)
+    refused = [k for k, x in enumerate(taken) if not x.used]
+    instants = _suspects(before, taken, camera, refused, odds)
     found: dict[Part, _Jump] = {}
     filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
@@ -246,7 +252,7 @@ def _follow_after(
         camera: The one whose images do not fit.
         step: Takes an image with a filter.
     """
-    f, jumps = deepcopy(before), _jumps(before, camera)
+    f, jumps = deepcopy(before), _jumps(before.layout, before.state, camera)
     if Part.KNOCK in parts:
         jumps[Part.KNOCK] = np.concatenate([jumps[Part.SHIFT], jumps[Part.MOUNTING]], axis=1)
     columns = np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1)
@@ -265,43 +271,39 @@ def _follow_after(
 
 
 def _suspects(
-    before: CalibrationFilter, images: Frames, camera: str, step: Step, odds: float
-) -> tuple[float, list[int], dict[Part, set[int]]]:
+    before: CalibrationFilter, taken: Sequence[Taken], camera: str, refused: Sequence[int], odds: float
+) -> dict[Part, set[int]]:
     """Find what may have jumped, and when.
 
     Args:
-        before: See `what_jumped`, also for `images`, `camera` and `step`.
-        images: Since then.
+        before: See `what_jumped`, also for `taken` and `camera`.
+        taken: Since then.
         camera: The one whose images do not fit.
-        step: Takes an image with a filter.
+        refused: Which of the images are.
         odds: By how much a jump must be more likely than none, in logarithms.
 
     Returns:
-        Log-likelihood of the images without a jump, and those that are refused; by part, the images just
-        before which it may have jumped, nothing where no jump is likely.
+        By part, the images just before which it may have jumped, nothing where no jump is likely.
     """
-    f = deepcopy(before)
-    f.jumps = scores = JumpScores.of(len(f.S), sum(x.shape[1] for x in _jumps(f, camera).values()))
-    likelihood, refused, fits = 0.0, list[int](), True
-    for k, (t_cam_s, frame) in enumerate(images):
-        jumps = _jumps(f, camera)
-        scores.begin(np.concatenate(list(jumps.values()), axis=1))
-        report = step(f, frame, t_cam_s)
-        likelihood += 0.0 if report is None else report.log_likelihood
-        fits = report is None or report.used
-        if not fits:
-            refused.append(k)
-    ends = np.cumsum([x.shape[1] for x in jumps.values()])
-    own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps.items(), ends, strict=True)}
+    states, layout = [before.state, *(x.state for x in taken[:-1])], before.layout
+    jumps = [_jumps(layout, state, camera) for state in states]
+    columns = [np.concatenate(list(x.values()), axis=1) for x in jumps]
+    drifts = [
+        (c.timeshift, c.skew)
+        for c in layout.cameras.values()
+        if c.timeshift is not None and c.skew is not None
+    ]
+    scores = JumpScores.of([x.passed for x in taken], columns, drifts)
+    ends = np.cumsum([x.shape[1] for x in jumps[0].values()])
+    own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps[0].items(), ends, strict=True)}
     if Part.SHIFT in own and Part.MOUNTING in own:
         own[Part.KNOCK] = slice(own[Part.SHIFT].start, own[Part.MOUNTING].stop)
     ratios = {part: scores.log_ratios(of) for part, of in own.items()}
-    if fits and max(x.max() for x in ratios.values()) < odds:
-        return likelihood, refused, {}
+    if taken[-1].used and max(x.max() for x in ratios.values()) < odds:
+        return {}
     best = {part: int(x.argmax()) for part, x in ratios.items()}
     # images that are refused tell the scores nothing; a large jump may be just before the first of them
-    instants = {part: {k - 1, k, k + 1, *refused[:1]} for part, k in best.items()}
-    return likelihood, refused, instants
+    return {part: {k - 1, k, k + 1, *refused[:1]} for part, k in best.items()}
 
 
 def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from vical_daemon.estimation.filter.jump_scores import SIZES, JumpScores, JumpSizes
+from vical_daemon.estimation.filter.jump_scores import SIZES, Corrected, JumpScores, JumpSizes, Moved
 
 IMAGES, SIGMA = 12, np.array([0.7, 0.4])
+NOISE, SECONDS, DRIFTS = 1e-3 * np.eye(12), 0.3, [(11, 10)]
 
 
 @pytest.fixture
@@ -15,6 +16,7 @@ def problem():
     rng = np.random.default_rng(3)
     F = np.eye(12)
     F[:9, :9] += 0.1 * rng.standard_normal((9, 9))
+    F[DRIFTS[0]] = SECONDS
     images = [
         (rng.standard_normal((5, 4)), rng.standard_normal((4, 12)), rng.standard_normal(5))
         for _ in range(IMAGES)
@@ -26,7 +28,7 @@ def run(F, images, jump_at=None, size=1.0):
     """Log-likelihood, and the scores where no jump is known."""
     S = 0.5 * np.eye(12)
     mean, total = np.zeros(12), 0.0
-    scores = JumpScores.of(12, 2)
+    passed = []
     columns = np.zeros((12, 2))
     columns[[9, 11], [0, 1]] = SIGMA
     P = S @ S.T
@@ -39,14 +41,13 @@ def run(F, images, jump_at=None, size=1.0):
         r = z - H @ mean
         total -= 0.5 * (r @ np.linalg.solve(V, r) + np.linalg.slogdet(V)[1])
         L = np.linalg.cholesky(P)
-        scores.begin(columns)
-        scores.update((ways, r), by_error, by_error @ L, L)
         K = P @ H.T @ np.linalg.inv(V)
         mean, P = mean + K @ r, P - K @ H @ P
-        L = np.linalg.cholesky(P)
-        scores.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
-        mean, P = F @ mean, F @ P @ F.T
-    return total, scores
+        after = np.linalg.cholesky(P)
+        seen = Corrected(L, after, ways, r, by_error @ L)
+        mean, P = F @ mean, F @ P @ F.T + NOISE
+        passed.append([seen, Moved(after, np.linalg.cholesky(P), F[:9, :9] @ after[:9, :9], SECONDS)])
+    return total, JumpScores.of(passed, [columns] * IMAGES, DRIFTS)
 
 
 def test_ratios_are_those_of_filters_that_know_of_the_jump(problem):
@@ -79,6 +80,7 @@ def estimated(F, images, size):
         jumped.correct(L, after, dx)
         L = after
         jumped.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
+        jumped.D[11] += SECONDS * jumped.D[10]  # as the filter does
         mean, joint = motion @ mean, motion @ joint @ motion.T
     return total, size**2 * (mean[12:] ** 2 + np.diag(joint)[12:]), jumped
 

@@ -42,7 +42,7 @@ def test_nothing_has_changed_where_images_fit_again_after_a_while(fix):
 )
 @pytest.mark.parametrize("certain", [True, False])
 def test_a_step_is_announced_if_it_exceeds_what_is_left_open(part, kind, step, sigma, certain):
-    """On EuRoC a lens was announced to have stepped by 0.7 px, with 0.8 and 0.5 px of sigma before and after."""
+    """On EuRoC a lens was said to have stepped by 0.7 px, with 0.8 and 0.5 px of sigma before and after."""
     f = some_filter()[0]
     where, lens = f.layout.cameras["cam0"], part is Part.LENS
     rows = [*range(where.intrinsics.start, where.intrinsics.stop)] if lens else [where.timeshift]

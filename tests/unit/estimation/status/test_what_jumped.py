@@ -1,0 +1,36 @@
+"""Tests for jumps use what the images did to the filter: they follow them again only if a jump is likely."""
+
+import numpy as np
+
+from tests.unit.estimation.some_filter import NAME, some_filter
+from vical_daemon.estimation.filter.jump_scores import Corrected
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.status.recent_past import Taken
+from vical_daemon.estimation.status.what_jumped import what_jumped
+
+
+def images(f, innovation):
+    """Three images in which the camera turns, each of them with an innovation over its noise."""
+    frame = PointsFrame(NAME, 0, np.arange(8), np.zeros((8, 2)))
+    moves = 2.0 * f.S[f.layout.cameras[NAME].rotation]
+    done = [Corrected(f.S, f.S, np.eye(3), innovation, moves)]
+    return [Taken((0.1 * k, frame), True, 0.0, f.state, done) for k in range(3)]
+
+
+def test_images_without_a_jump_are_not_followed_again():
+    f = some_filter()[0]
+
+    def step(*_):
+        raise AssertionError
+
+    assert what_jumped(f, images(f, np.full(3, 0.1)), NAME, step) is None
+
+
+def test_images_that_a_jump_explains_are_followed_again():
+    f, followed = some_filter()[0], []
+
+    def step(*image):
+        followed.append(image)
+
+    what_jumped(f, images(f, np.full(3, 1e3)), NAME, step)
+    assert followed
