@@ -227,7 +227,7 @@ def _play_all(
     go on, the next begins without it, and that recording is tried once more at the end. Files that continue
     one another are one recording: nothing is found anew between them.
     """
-    order = _continuous(parts)
+    order = continuous(parts)
     count = len(order)
     uses: dict[int, InputUse] = {}
     free_ns, frames = parts[0].begin_ns, 0
@@ -256,8 +256,8 @@ def _play_all(
     return [uses[number] for number in range(len(parts))]
 
 
-def _continuous(parts: Sequence[Job]) -> list[list[int]]:
-    """Numbers of the parts; those of files into which one recording was split are together."""
+def continuous(parts: Sequence[Job]) -> list[list[int]]:
+    """Return the numbers of some parts; those of files into which one recording was split are together."""
     out = [[0]]
     for number in range(1, len(parts)):
         if abs(parts[number].begin_ns - parts[number - 1].end_ns) < _SPLIT_NS:

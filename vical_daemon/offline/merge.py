@@ -14,7 +14,7 @@ from typing import Any
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.result import CameraEstimate, Status
 from vical_daemon.estimation.tools.agreement import Agreement, Difference, agreements, calibrations
-from vical_daemon.offline.calibrate import Outcome, Progress, document, run_job
+from vical_daemon.offline.calibrate import Outcome, Progress, continuous, document, run_job
 from vical_daemon.offline.calibration_job import Job
 
 AGREES, DISAGREES, CANNOT_TELL = "agrees", "disagrees", "cannot tell"
@@ -60,7 +60,11 @@ def merge(job: Job, progress: Progress, *, keep_frames: bool = False) -> MergeOu
     used = [k for k, one in enumerate(found) if one.agrees is not False]
     if not any(found[k].agrees for k in used) and any(one.agrees is False for one in found):
         return MergeOutcome(found, [], alone[0])
-    used.sort(key=lambda k: found[k].agrees is None)  # those without a result of their own last
+    files = [[used[k] for k in one] for one in continuous([job.parts[k] for k in used])]
+    files.sort(
+        key=lambda one: all(found[k].agrees is None for k in one)
+    )  # without a result of their own last
+    used = [k for one in files for k in one]
     while True:
         outcome = run_job(job, part_of(0.5, 0.5), keep_frames=keep_frames, only=used)
         changed = _changed(outcome, used)

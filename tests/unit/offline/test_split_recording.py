@@ -34,23 +34,23 @@ def _part(run: SimulatedRun, begin_s: float, end_s: float) -> SimulatedRun:
     )
 
 
-def _calibrate(capsys, *folders: Path) -> dict:
+def _calibrate(capsys, *folders: Path, command: str = "calibrate") -> dict:
     files = ["--target", str(folders[0] / "target.yaml"), "--initial", str(folders[0] / "initial.yaml")]
-    assert main(["calibrate", *map(str, folders), *files, "--json"]) in (0, 3)
+    assert main([command, *map(str, folders), *files, "--json"]) in (0, 3)
     return json.loads(capsys.readouterr().out)
 
 
 def test_files_that_continue_one_another_are_one_recording(run, tmp_path, capsys) -> None:
     whole = _calibrate(capsys, write_asl(tmp_path / "whole", run, 100.0))
     ends = [0.0, *CUTS_S, 20.0]
-    names = [f"part{k}" for k in range(3)]
-    parts = [_part(run, *ends[k : k + 2]) for k in range(3)]
-    split = _calibrate(
-        capsys, *(write_asl(tmp_path / n, p, 100.0) for n, p in zip(names, parts, strict=True))
-    )
+    files = [
+        write_asl(tmp_path / f"part{k}", _part(run, *ends[k : k + 2]), 100.0) for k in range(len(ends) - 1)
+    ]
+    split, merged = (_calibrate(capsys, *files, command=command) for command in ("calibrate", "merge"))
     for key in ("p_m", "covariance"):
-        first, second = (x["cameras"]["cam0"]["T_imu_cam"][key] for x in (whole, split))
-        np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-12)
+        first, *others = (x["cameras"]["cam0"]["T_imu_cam"][key] for x in (whole, split, merged))
+        for other in others:
+            np.testing.assert_allclose(first, other, rtol=1e-9, atol=1e-12)
     assert split["frames"] == whole["frames"] == sum(x["frames"] for x in split["inputs"])
     # the first file is too short for a start of its own
     assert [x["used"] for x in split["inputs"]] == [True, True, True]
