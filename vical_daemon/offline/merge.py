@@ -61,9 +61,8 @@ def merge(job: Job, progress: Progress, *, keep_frames: bool = False) -> MergeOu
     if not any(found[k].agrees for k in used) and any(one.agrees is False for one in found):
         return MergeOutcome(found, [], alone[0])
     files = [[used[k] for k in one] for one in continuous([job.parts[k] for k in used])]
-    files.sort(
-        key=lambda one: all(found[k].agrees is None for k in one)
-    )  # without a result of their own last
+    # those without a result of their own last
+    files.sort(key=lambda one: all(found[k].agrees is None for k in one))
     used = [k for one in files for k in one]
     while True:
         outcome = run_job(job, part_of(0.5, 0.5), keep_frames=keep_frames, only=used)

@@ -381,6 +381,7 @@ class CalibrationFilter:
 
     def forget(self, index: int, sigma: float) -> None:
         """Take one error as known to `sigma` only, whatever the rest says about it."""
+        self.S = self.S.copy()  # `passed` refers to it
         self.S[index] = 0.0
         self.reopen(index, sigma)
 

@@ -111,7 +111,7 @@ def with_camera(known: CalibrationFilter, name: str, start: State) -> Calibratio
     root = np.diag(sigmas)[:, layout.errors_of(name)]
     out.S[layout.errors_of(name)] = 0.0
     out.inflate_covariance(root)
-    out.absent = out.absent - {name}
+    out.absent, out.passed = out.absent - {name}, []  # nothing is known of a change before this
     return out
 
 

@@ -215,3 +215,11 @@ def test_allowance_for_the_bias_of_lever_arms_keeps_the_last_column(recording):
     allowed = f.allowing_for_arm_bias()
     np.testing.assert_array_equal(allowed.S[:, -1], apart)
     np.testing.assert_allclose(allowed.S @ allowed.S.T, f.S @ f.S.T + np.outer(step, step), atol=1e-15)
+
+
+def test_an_error_that_is_forgotten_leaves_what_was_passed_as_it_was(recording):
+    """What an image did to the filter refers to the square roots of then: tests for jumps solve with them."""
+    f, *_ = build(recording)
+    then, before = f.S, f.S.copy()
+    f.forget(f.layout.cameras["cam0"].timeshift, 5e-3)
+    assert np.array_equal(then, before) and not np.array_equal(f.S, before)
