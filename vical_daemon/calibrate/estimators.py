@@ -28,6 +28,10 @@ class Estimator(Protocol):
         """Take the points of one image."""
         ...
 
+    def do_without(self, cameras: frozenset[str]) -> None:
+        """Wait for none of these cameras: nothing comes from them now."""
+        ...
+
     @property
     def waiting(self) -> int:
         """Images that have been neither used nor rejected yet."""
@@ -93,11 +97,16 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
 
 
 def input_keys(config: Config) -> list[str]:
-    """Return the keys that the estimator reads: one IMU and its status, points or tracks of each camera."""
+    """Return the keys that the estimator reads: one IMU, points or tracks of each camera, and statuses."""
     key_of = topics.TRACKS.key if config.calibration.mode == "target_free" else topics.POINTS.key
     imu = topics.IMU.key(config.rig, config.calibration_imu)
-    status = topics.STATUS.key(config.rig, "imu")
-    return [imu, status, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
+    points = [key_of(config.rig, camera) for camera in config.calibration_cameras]
+    return [imu, *status_keys(config.rig), *points]
+
+
+def status_keys(rig: str) -> list[str]:
+    """Return the keys on which the roles that data come from say how they and their devices are."""
+    return [topics.STATUS.key(rig, role) for role in ("imu", "camera", "detect")]
 
 
 def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:

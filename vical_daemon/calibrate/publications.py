@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from vical_daemon.bus import topics
 from vical_daemon.bus.messages import (
     DiagnosticStatus,
@@ -17,11 +19,11 @@ from vical_daemon.config.model import Config
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 
 
-def calibration_messages(config: Config, estimate: CalibrationEstimate) -> list[Message]:
-    """Return the estimate of every camera, and its pose once there is a solution."""
+def calibration_messages(config: Config, estimates: Mapping[str, CalibrationEstimate]) -> list[Message]:
+    """Return the estimate of every camera, by its name, and its pose once there is a solution."""
     messages: list[Message] = []
     imu = config.calibration_imu
-    for name in config.calibration_cameras:
+    for name, estimate in estimates.items():
         messages.append((topics.CALIBRATION.key(config.rig, name), encode_calibration(estimate, name)))
         camera = estimate.cameras.get(name)
         if camera is not None:

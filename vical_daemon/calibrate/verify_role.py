@@ -255,7 +255,8 @@ class _VerifyService:
         if self._in_use is not None and self._state is not CheckState.CALIBRATING:
             events = [] if self._verification is None else self._verification.events()
             estimate = self._persistence.said(self._in_use.estimate, events)
-            publish(self._bus, calibration_messages(self._config, estimate))
+            each = dict.fromkeys(self._config.calibration_cameras, estimate)
+            publish(self._bus, calibration_messages(self._config, each))
             publish(self._bus, companion_messages(self._config, estimate))
 
     def _result(self, camera: str, say: CalibrationEstimate | None = None) -> VerifyResult:

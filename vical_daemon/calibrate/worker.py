@@ -23,7 +23,7 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.outgoing import Message
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
-from vical_daemon.calibrate.estimators import Estimator
+from vical_daemon.calibrate.estimators import Estimator, status_keys
 from vical_daemon.calibrate.predictions import Predictions
 from vical_daemon.calibrate.publications import (
     calibration_messages,
@@ -31,6 +31,7 @@ from vical_daemon.calibrate.publications import (
     companion_messages,
 )
 from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
+from vical_daemon.calibrate.silence import Silence
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.events import Event
@@ -76,7 +77,9 @@ class EstimateRole:
         self._period_s, self._keep, self._inspect = period_s, keep, inspect
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
-        self._status_key = topics.STATUS.key(config.rig, "imu")
+        self._status_keys = status_keys(config.rig)
+        rates_hz = {name: config.cameras[name].rate_hz for name in config.calibration_cameras}
+        self._silence = Silence(config.calibration_imu, rates_hz)
         self._order: ReorderBuffer[ImuMessage | PointsFrame] = ReorderBuffer(config.calibration.lag_s)
         self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
         self._span_ns: tuple[int, int] | None = None  # first and last of all stamps that passed
@@ -92,8 +95,10 @@ class EstimateRole:
             if sample.key == self._imu_key:
                 imu = admit_imu(sample.payload)
                 self._sort_in(sample.key, imu.stamp_ns, imu)
-            elif sample.key == self._status_key:
-                self._stamps_known(decode_diagnostics(sample.payload))
+            elif sample.key in self._status_keys:
+                message = decode_diagnostics(sample.payload)
+                self._silence.take(message)
+                self._stamps_known(message)
             else:
                 self.images += 1
                 frame = admit_points(sample.payload).to_frame()
@@ -157,6 +162,9 @@ class EstimateRole:
         self._feed(self._order.pop_due())
         if now_s is None:
             now_s = (self._order.newest_ns or 0) * 1e-9
+        else:
+            self._silence.look(now_s)
+            self.estimator.do_without(self._silence.cameras)
         return self._publications(now_s)
 
     def finish(self) -> list[Message]:
@@ -183,13 +191,23 @@ class EstimateRole:
         self._next_s = self._next_companion_s = -float("inf")
 
     def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
+        readings, repeated = 0, self._repeated("imu")
         for item in items:
             if isinstance(item, ImuMessage):
+                readings += 1
                 self.estimator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
             else:
                 self._images_in_order -= 1
+                images_repeated = self._repeated("images")
                 self.estimator.add_points(item)
+                self._silence.image_came(item.camera, new=self._repeated("images") == images_repeated)
                 self._report(self.estimator.process())
+        if readings:
+            self._silence.imu_came(new=self._repeated("imu") < repeated + readings)
+
+    def _repeated(self, what: str) -> int:
+        """Readings (``imu``) or ``images`` so far that were the one before once more."""
+        return self.estimator.left_out.get(f"{what}_repeated", 0)
 
     def _report(self, frames: Sequence[Any]) -> None:
         self._predictions.take(frames if self._stamps is None else self._stamps.as_they_came(frames))
@@ -202,7 +220,8 @@ class EstimateRole:
         self._next_s = now_s + self._period_s
         estimate = self.estimator.estimate()
         self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
-        messages = calibration_messages(self.config, estimate) + self._predictions.messages()
+        told = {name: self._silence.told(estimate, name) for name in self.config.calibration_cameras}
+        messages = calibration_messages(self.config, told) + self._predictions.messages()
         if now_s >= self._next_companion_s:
             self._next_companion_s = now_s + COMPANION_S
             messages += companion_messages(self.config, estimate)
@@ -227,7 +246,10 @@ class EstimateRole:
             "stamp_jumps": str(sum(gate.jumps for gate in self._gates.values())),
             **{name: str(count) for name, count in self.estimator.left_out.items()},
         }
-        status = calibration_status(self.latest, counters)
+        status = calibration_status(self.latest, counters | {"silent": ", ".join(self._silence.silent)})
+        if self._silence.silent:
+            text = f"{status.message}; {self._silence.words()}"
+            status = replace(status, level=max(status.level, Level.WARN), message=text)
         if stuck_s > STUCK_S:
             text = f"stuck: images arrive, none used or refused for {stuck_s:.0f} s"
             status = replace(status, level=Level.STALE, message=text)

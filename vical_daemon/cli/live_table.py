@@ -81,6 +81,8 @@ def picture(
     colour = {"converged": "green", "degenerate": "yellow", "inconsistent": "red"}.get(
         estimate.status, "cyan"
     )
+    if estimate.reason and colour == "green":  # known, but nothing follows it now
+        colour = "yellow"
     stale = "" if silent_s is None else f"stale, {silent_s:.0f} s old, was "
     head = Text.assemble(
         (f"{stale}{estimate.status}", f"bold {'red' if stale else colour}"),

@@ -133,6 +133,10 @@ class Calibrator:
             self._seek_shift.add(camera)
             self.watch.shift_reopened()
 
+    def do_without(self, cameras: frozenset[str]) -> None:
+        """Wait for none of these cameras: nothing comes from them now."""
+        self.rig.silent = self.evaluator.silent = cameras
+
     @property
     def waiting(self) -> int:
         """Images that wait for inertial data."""

@@ -157,6 +157,9 @@ class TargetFreeCalibrator:
             self.evaluator.contradicted(0.0)
         self._seek_shift = self.latest is not None
 
+    def do_without(self, cameras: frozenset[str]) -> None:
+        """Nothing comes from these cameras now; one camera alone waits for no other."""
+
     @property
     def waiting(self) -> int:
         """Images that wait for inertial data; before there is a window, all are tried again and again."""

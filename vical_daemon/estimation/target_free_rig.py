@@ -49,6 +49,7 @@ class TargetFreeRig:
             raise ValueError("no camera to calibrate")
         self.parts = {name: TargetFreeCalibrator(options, {name: prior}) for name, prior in cameras.items()}
         self._strangers = 0  # images of cameras that nobody asked for
+        self._silent: frozenset[str] = frozenset()  # cameras from which nothing comes now
 
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s."""
@@ -67,6 +68,10 @@ class TargetFreeRig:
             self._strangers += 1
         else:
             part.add_points(frame)
+
+    def do_without(self, cameras: frozenset[str]) -> None:
+        """Wait for none of these cameras: nothing comes from them now."""
+        self._silent = cameras
 
     @property
     def waiting(self) -> int:
@@ -101,7 +106,9 @@ class TargetFreeRig:
 
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
-        return together({name: part.estimate() for name, part in self.parts.items()})
+        each = {name: part.estimate() for name, part in self.parts.items()}
+        known = {name: e for name, e in each.items() if e.cameras or name not in self._silent}
+        return together(known or each)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""

@@ -114,9 +114,20 @@ def headline(status: str, guidance: Guidance) -> str:
     return _HEADLINES[status]
 
 
-def fault_headline(component: str) -> str:
-    """Say in one short sentence that a device or role does not work."""
-    return f"{component} does not work."
+def fault_headline(component: str, age_s: float | None = None) -> str:
+    """Say in one short sentence that a device or role does not work.
+
+    Args:
+        component: Its name.
+        age_s: How long ago its last data came, s; None: not known, or there were none.
+    """
+    since = "" if age_s is None or age_s < 1.0 else f": no data for {age_s:.0f} s"
+    return f"{component} does not work{since}."
+
+
+def silent_headline(component: str) -> str:
+    """Say in one short sentence that nothing new comes from a device which reports no error."""
+    return f"{component} delivers nothing new."
 
 
 def silence(age_s: float) -> str:

@@ -34,6 +34,7 @@ from vical_daemon.estimation.wording import (
     headline,
     motion_caption,
     silence,
+    silent_headline,
 )
 from vical_daemon.results.differences import differences
 from vical_daemon.results.report.scene import rig as rig_document
@@ -203,11 +204,12 @@ class WebState:
             camera.rows = camera.rows[:half:2] + camera.rows[half:]
 
     def _document(self, *, full: bool) -> dict[str, Any]:
-        fault = self._fault()
         cameras, now_s = {}, self._clock()
         for name, camera in sorted(self._cameras.items()):
             whole = full or camera.restarted
+            fault = self._fault(name)
             entry = summary(camera.latest, now_s - camera.arrived_s, fault is not None)
+            entry["fault"] = fault
             entry["events"] = [event_document(event) for event in camera.events]
             entry |= self._result(name, camera.latest)
             if fault is None and not entry["stale"]:
@@ -231,7 +233,7 @@ class WebState:
             "rig": self.rig,
             "cameras": cameras,
             "devices": devices,
-            "fault": fault,
+            "fault": self._fault(),
             "sights": self._sights(full=full),
         }
         if full:
@@ -287,14 +289,39 @@ class WebState:
             sights[name] = watch.document(known, full=full)
         return sights
 
-    def _fault(self) -> dict[str, str] | None:
-        """Return the first component that reports an error; until it is fixed, the page gives no advice."""
-        for _, (_, statuses) in sorted(self._statuses.items()):
-            for status in statuses:
-                if status.level >= Level.ERROR:
-                    headline = fault_headline(status.name)
-                    return {"name": status.name, "headline": headline, "message": status.message}
+    def _fault(self, camera: str = "") -> dict[str, str] | None:
+        """Return the first component that does not work; until it does, the page gives no advice.
+
+        Args:
+            camera: Only what the calibration of this camera depends on; empty: all of the rig.
+        """
+        statuses = [s for _, (_, said) in sorted(self._statuses.items()) for s in said]
+        for status in statuses:
+            if status.level >= Level.ERROR and _concerns(status.name, camera):
+                return fault_document(status)
+        for status in statuses:
+            silent = filter(None, status.values.get("silent", "").split(", "))
+            name = next((name for name in silent if _concerns(name, camera)), "")
+            if name:
+                shown = self._cameras.get(camera)
+                message = status.message if shown is None else shown.latest.estimate.reason
+                return {"name": name, "headline": silent_headline(name), "message": message}
         return None
+
+
+def _concerns(component: str, camera: str) -> bool:
+    """Whether the calibration of a camera depends on a component; empty: that of any camera."""
+    kind, _, name = component.partition("/")
+    return not camera or kind not in ("camera", "detect", "verify") or name == camera
+
+
+def fault_document(status: DiagnosticStatus) -> dict[str, str]:
+    """Return what the page says of a component that reports an error."""
+    with suppress(KeyError, ValueError):
+        age_s = float(status.values["data_age_s"])
+        headline = fault_headline(status.name, age_s if math.isfinite(age_s) else None)
+        return {"name": status.name, "headline": headline, "message": status.message}
+    return {"name": status.name, "headline": fault_headline(status.name), "message": status.message}
 
 
 def is_stale(age_s: float) -> bool:

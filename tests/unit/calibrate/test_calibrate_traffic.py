@@ -49,6 +49,9 @@ class Recorded:
     def stamps_known_to(self, sigma_s: float) -> None:
         self.sigma_s = sigma_s
 
+    def do_without(self, cameras: frozenset[str]) -> None:
+        self.without = cameras
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Any, specific_force_mps2: Any) -> None:
         if self.fails:
             raise np.linalg.LinAlgError("SVD did not converge")

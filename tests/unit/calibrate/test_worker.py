@@ -57,6 +57,9 @@ class FakeEstimator:
     def stamps_known_to(self, sigma_s: float) -> None:
         self.stamp_sigma_s = sigma_s
 
+    def do_without(self, cameras: frozenset[str]) -> None:
+        self.without = cameras
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         self.fed.append(("imu", t_imu_ns))
 
@@ -166,6 +169,8 @@ class TestEstimate:
         assert input_keys(config) == [
             "vical/rover/imu/imu0",
             "vical/rover/status/imu",
+            "vical/rover/status/camera",
+            "vical/rover/status/detect",
             "vical/rover/camera/cam0/points",
         ]
 

@@ -31,12 +31,13 @@ def runs():
     return {"cam0": simulate(SEED, LENGTH_S, rig=first), "cam1": simulate(SEED + 1, LENGTH_S, rig=second)}
 
 
-def calibrate(runs, seen, renumber=None, alike=False):
+def calibrate(runs, seen, renumber=None, alike=False, silent=()):
     """Feed both cameras where `seen(name, seconds)`; cam1 numbers by `renumber`. Estimates, one a second."""
     lens = runs["cam0"].rig.lens
     known = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
     options = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=alike)
     c = Calibrator(options, dict.fromkeys(runs, known), runs["cam0"].points_m)
+    c.do_without(frozenset(silent))
     data = runs["cam0"]
     begin_ns = int(data.t_imu_ns[0])
     frames = [
@@ -99,6 +100,14 @@ def test_a_camera_that_comes_later_joins_those_that_are_calibrated(runs, seen):
     sigma_m = np.sqrt(np.diag(both.cameras["cam0"].T_imu_cam.covariance)[:3])
     before_m = np.sqrt(np.diag(alone[-1].cameras["cam0"].T_imu_cam.covariance)[:3])
     assert (sigma_m < 1.1 * before_m).all()  # nothing that was known is lost
+
+
+def test_a_camera_that_is_not_connected_is_not_waited_for(runs):
+    estimates = calibrate(runs, lambda name, t_s: name == "cam0" and t_s < 16.0, silent=["cam1"])
+    assert estimates[-1].status is Status.CONVERGED
+    assert list(estimates[-1].cameras) == ["cam0"]
+    assert not any("cam1" in e.reason for e in estimates)
+    assert largest_z(estimates[-1], runs) < 4.0
 
 
 @pytest.mark.parametrize("from_s", [0.0, 9.0])

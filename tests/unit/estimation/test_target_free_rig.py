@@ -112,6 +112,19 @@ def test_a_blind_camera_holds_up_no_other_and_is_named(pair):
     assert set(estimate.cameras) == {"left"}
 
 
+def test_a_camera_that_is_not_connected_is_not_waited_for(pair, played):
+    rig = rig_of(pair)
+    rig.do_without(frozenset({"right"}))
+    play(rig, pair, blind=("right",))
+    estimate = rig.estimate()
+    assert estimate.status == Status.CONVERGED and "right" not in estimate.reason
+    played[0].do_without(frozenset({"right"}))  # what is known of it stays
+    assert set(played[0].estimate().cameras) == {"left", "right"}
+    played[0].do_without(frozenset())
+    rig.do_without(frozenset())
+    assert rig.estimate().status == Status.WAITING
+
+
 def test_strangers_are_counted_and_no_camera_is_refused(pair):
     rig = rig_of(pair)
     rig.add_points(points_frame(pair["left"].frames[0], camera="rear"))

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import (
     Change,
     CheckState,
+    DiagnosticStatus,
     Level,
     VerifyResult,
     decode_calibration,
@@ -253,6 +255,31 @@ def test_a_device_that_does_not_work_comes_before_advice(bus, state, web_feed):
     assert document["fault"]["message"] == "no data for 3.0 s"
     entry = document["cameras"]["cam0"]
     assert entry["guidance"] == entry["motion"]["caption"] == "" and entry["motion"]["rotate"] == []
+
+
+def test_a_fault_of_another_camera_takes_no_advice_away(bus, state, web_feed):
+    rng, asked = np.random.default_rng(0), Guidance(Verb.TURN, ("x",))
+    web_feed.publish_estimate(bus, web_feed.estimate(9.0, rng, Status.CONVERGING, motion=asked))
+    values = {"data_age_s": "12.3"}
+    gone = DiagnosticStatus(Level.ERROR, "camera/cam1", "no such device", values=values)
+    bus.publish(topics.STATUS.key("rig0", "camera"), encode_diagnostics(0, "camera", [gone]))
+    document = state.tick()
+    assert document["fault"]["headline"] == "camera/cam1 does not work: no data for 12 s."
+    entry = document["cameras"]["cam0"]
+    assert entry["fault"] is None and entry["guidance"] and entry["motion"]["rotate"] == ["x"]
+
+
+def test_a_device_that_repeats_itself_is_a_fault_though_it_reports_none(bus, state, web_feed):
+    rng = np.random.default_rng(0)
+    reason = "nothing new from cam0 for 8 s: it delivers the same again and again"
+    web_feed.publish_estimate(bus, web_feed.estimate(30.0, rng, Status.CONVERGED, reason=reason))
+    silent = DiagnosticStatus(Level.WARN, "estimate", "converged 100%", values={"silent": "camera/cam0"})
+    bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [silent]))
+    fault = state.tick()["cameras"]["cam0"]["fault"]
+    assert fault["headline"] == "camera/cam0 delivers nothing new." and fault["message"] == reason
+    spoken = replace(silent, values={"silent": ""})
+    bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [spoken]))
+    assert state.tick()["cameras"]["cam0"]["fault"] is None
 
 
 def test_withheld_directions_are_named_without_a_second_advice(bus, state, web_feed):

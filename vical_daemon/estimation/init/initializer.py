@@ -162,11 +162,12 @@ class Initializer:
         spans_s = {name: f[-1][0] - f[0][0] if f else 0.0 for name, f in self._frames.items()}
         ready = [name for name, span_s in spans_s.items() if span_s >= MIN_SPAN_S]
         short = [name for name in spans_s if name not in ready]
-        if short and max(spans_s.values()) < max(wait_s, MIN_SPAN_S):
+        waited_for = [name for name in short if name not in rig.silent]
+        if not ready or (waited_for and max(spans_s.values()) < max(wait_s, MIN_SPAN_S)):
             if self._rests:
                 return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
             if ready:
-                return _none(not_in_view(short))
+                return _none(not_in_view(waited_for))
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)

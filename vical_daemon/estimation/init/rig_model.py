@@ -27,6 +27,7 @@ class RigModel:
         target: Points of the target as far as its size is known, m, shape (n, 3).
         size: Of the target over the stated one, where that is far off.
         layout: Where the errors live.
+        silent: Cameras from which nothing comes now: they are not waited for.
         turns: Numbers the points of a target that looks the same upside down.
     """
 
@@ -34,6 +35,7 @@ class RigModel:
         self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray
     ) -> None:
         self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
+        self.silent: frozenset[str] = frozenset()
         self._stated = target_points_m
         self._options = options
         self.turns = HalfTurns(target_points_m, alike=options.target_alike)

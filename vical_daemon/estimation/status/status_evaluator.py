@@ -53,6 +53,7 @@ class StatusEvaluator(Evaluator):
         self.frames = 0
         self.in_doubt = ""
         self.clocks_doubtful = False  # a time shift may be drifting
+        self.silent: frozenset[str] = frozenset()  # cameras from which nothing comes now
         self.not_joined = ""  # why a camera that is seen now could not join the others yet
         self._partial = ""
         self._reopened_s = -np.inf
@@ -270,8 +271,9 @@ class StatusEvaluator(Evaluator):
         if not lacking:
             if self._partial:
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
-            if f.absent:
-                return Verdict(Status.CONVERGING, self.not_joined or not_in_view(f.absent))
+            waited_for = f.absent - self.silent
+            if waited_for:
+                return Verdict(Status.CONVERGING, self.not_joined or not_in_view(waited_for))
             return self._once_known(enough=self.confirms(f.state.t_s), doubt=self.in_doubt)
         lens = self._lens_to_blame(f, missing)
         if lens:

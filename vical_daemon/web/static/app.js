@@ -124,12 +124,16 @@ function round(value, digits) {
   return value === null || value === undefined ? null : Number(value.toPrecision(digits));
 }
 
+function faultOf(latest) { // that of another camera does not keep this one from being calibrated
+  return latest ? latest.fault : page.fault;
+}
+
 function drawWords() {
   const latest = page.latest[page.camera];
   const status = latest ? latest.status : "waiting"; // "stale" when the estimates have stopped
   if (page.status && status === "converged" && page.status !== status) meters.cue(1320);
   page.status = status;
-  const fault = page.fault; // what does not work comes before any advice
+  const fault = faultOf(latest); // what does not work comes before any advice
   $("status").className = `pill ${fault ? "fault" : status}`;
   document.querySelector("main").classList.toggle("stale", status === "stale");
   setText("status", fault ? "fault" : status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
@@ -187,6 +191,7 @@ function drawDevices() {
 function drawTabs() {
   const names = [...new Set([...page.views, ...Object.keys(page.latest)])].sort();
   if (page.camera === null && names.length) choose(names[0]);
+  for (const tab of $("tabs").children) tab.classList.toggle("bad", Boolean(page.latest[tab.textContent]?.fault));
   if ($("tabs").dataset.names === names.join()) return;
   $("tabs").dataset.names = names.join();
   $("tabs").replaceChildren(...(names.length > 1 ? names.map((name) => {
@@ -213,7 +218,7 @@ function keepSights(sights, full) { // a full message has the path, later ones t
 function drawSight() {
   const sight = page.sights[page.camera], latest = page.latest[page.camera];
   // No advice with a fault or old values, and none that contradicts "nothing is missing".
-  const quiet = page.fault || !latest || latest.stale || (latest.status === "converged" && !latest.guidance);
+  const quiet = faultOf(latest) || !latest || latest.stale || (latest.status === "converged" && !latest.guidance);
   camera.coverage = sight ? sight.coverage : null;
   camera.setWanted(sight && sight.wanted && !quiet ? sight.wanted : null);
   meters.sight(sight, camera.last && camera.last.light);
