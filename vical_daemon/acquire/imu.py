@@ -35,7 +35,7 @@ class ImuEncoder:
         self.key = topics.IMU.key(rig, name)
         self._encode, self._offset_ns = imu_encoder(name), clock.unix_ns(0)
         self._order = StampOrder()
-        self._worst_sigma_ns = 0
+        self._worst_sigma_ns: int | None = None  # None: no samples
 
     def message(self, sample: ImuSample) -> bytes | None:
         """Return the message of one sample; None if its stamp does not increase.
@@ -45,14 +45,19 @@ class ImuEncoder:
         t_host_ns = sample.t_host_ns
         if not self._order.admits(t_host_ns):  # the device clock restarted
             return None
-        if sample.t_sigma_ns > self._worst_sigma_ns:
+        if self._worst_sigma_ns is None or sample.t_sigma_ns > self._worst_sigma_ns:
             self._worst_sigma_ns = sample.t_sigma_ns
         return self._encode(t_host_ns + self._offset_ns, sample.gyro_rps, sample.specific_force_mps2)
 
     def counters(self) -> dict[str, str]:
-        """Return counters that the driver does not keep; the stamp sigma is the worst since the last call."""
-        sigma_us, self._worst_sigma_ns = self._worst_sigma_ns * 1e-3, 0
-        return {"stamps_backwards": str(self._order.backwards), "stamp_sigma_us": f"{sigma_us:.1f}"}
+        """Return counters that the driver does not keep.
+
+        The sigma of the stamps is the worst since the last call. Without samples there is none: a zero
+        would say that stamps are exact, and errors of a new mapping of the clock would look like a drift.
+        """
+        sigma_ns, self._worst_sigma_ns = self._worst_sigma_ns, None
+        counters = {"stamps_backwards": str(self._order.backwards)}
+        return counters if sigma_ns is None else counters | {"stamp_sigma_us": f"{1e-3 * sigma_ns:.1f}"}
 
 
 def open_imu(config: ImuConfig) -> ImuSource:

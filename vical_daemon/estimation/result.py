@@ -147,7 +147,7 @@ class CalibrationEstimate:
     Attributes:
         t_ns: Stamp of the newest data used (the imu's clock), ns.
         status: Where the calibration stands.
-        reason: Why, in words for a person; empty when converged.
+        reason: Why, in words for a person; empty when converged, unless nothing new arrives.
         progress: 0 to 1.
         guidance: What to do next, as text; empty: nothing missing.
         duration_s: Seconds of data used.

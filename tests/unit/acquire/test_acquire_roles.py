@@ -54,6 +54,15 @@ class TestAcquisition:
         assert role.message(ImuSample(5_000, 9_000, 1, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))) is None
         assert role.counters()["stamps_backwards"] == "1"
 
+    def test_an_imu_that_is_gone_does_not_claim_that_its_stamps_are_exact(self) -> None:
+        """As 0 us it made the estimator see a drift of the clocks when the IMU came back."""
+        role = imu_module.ImuEncoder("rover", "imu0", CLOCK)
+        assert "stamp_sigma_us" not in role.counters()
+        for t_ns, sigma_ns in ((5_000, 240_000), (6_000, 180_000)):
+            role.message(ImuSample(t_ns, t_ns, 1, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), t_sigma_ns=sigma_ns))
+        assert role.counters()["stamp_sigma_us"] == "240.0"
+        assert "stamp_sigma_us" not in role.counters()
+
     def test_every_setting_of_an_imu_reaches_its_driver(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked: dict[str, Any] = {}
         monkeypatch.setattr(gx3_module, "open_imu", lambda port, **given: asked.update(given, port=port))
