@@ -229,7 +229,11 @@ class V4l2Camera(Closing):
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
         # before anything takes time: a stamp of the wall clock is moved by the pair
         t_arrival_ns, t_realtime_ns = self._kernel.clocks_ns()
-        t_stamp_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns) or t_arrival_ns
+        before_ns = session.stamped_ns
+        known_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns, before_ns)
+        if known_ns is not None:
+            session.stamped_ns = known_ns
+        t_stamp_ns = known_ns or t_arrival_ns
         self._frames.numbered(t_stamp_ns, self._sequence.missing_before(buffer.sequence))
         image = self._image(session, buffer)
         if image is None:
@@ -242,7 +246,7 @@ class V4l2Camera(Closing):
             if not image.flags.owndata:
                 image = image.copy()
             session.node.queue(buffer.index)
-        raw = self._raw_stamp(session, buffer, t_arrival_ns, t_realtime_ns)
+        raw = self._raw_stamp(session, buffer, t_arrival_ns, t_realtime_ns, before_ns)
         frame = self._frames.frame(image, raw, sequence=buffer.sequence, t_arrival_ns=t_arrival_ns)
         self._say_rule(frame.stamp_rule)
         return frame
@@ -263,7 +267,12 @@ class V4l2Camera(Closing):
             return None
 
     def _raw_stamp(
-        self, session: V4l2Session, buffer: DequeuedBuffer, t_arrival_ns: int, t_realtime_ns: int
+        self,
+        session: V4l2Session,
+        buffer: DequeuedBuffer,
+        t_arrival_ns: int,
+        t_realtime_ns: int,
+        before_ns: int | None,
     ) -> RawStamp:
         if session.metadata is not None:
             fitted = session.metadata.stamp(buffer)
@@ -276,6 +285,7 @@ class V4l2Camera(Closing):
             realtime_ns=t_realtime_ns,
             forced=self._settings.stamp,
             uvc_hwtimestamps=session.uvc_hwtimestamps,
+            before_ns=before_ns,
         )
 
     def _say_rule(self, rule: str) -> None:

@@ -29,12 +29,16 @@ class V4l2Session:
         entry: Which node.
         settings: What is asked of the camera.
 
+    Attributes:
+        stamped_ns: The kernel's last stamp, CLOCK_MONOTONIC; None: there was none.
+
     Raises:
         DriverError: It cannot be opened, or refuses what is asked.
     """
 
     def __init__(self, kernel: Kernel, entry: NodeEntry, settings: CameraSettings) -> None:
         self.metadata: UvcMetadata | None = None
+        self.stamped_ns: int | None = None
         self.node = VideoNode(kernel, entry.path)
         try:
             self.identity: NodeIdentity = self.node.identity()

@@ -135,6 +135,20 @@ def test_nonsense_stamps_are_replaced_by_the_arrival(open_fake) -> None:
     assert frame.t_exposure_mid_ns == frame.t_arrival_ns
 
 
+@pytest.mark.parametrize("offset_ns", [0, 1_700_000_000_000_000_000])
+def test_images_that_waited_through_a_long_stall_keep_their_stamps(open_fake, kernel, offset_ns: int) -> None:
+    """A process that was stopped for 15 s finds a full ring: by their arrival these images were of now."""
+    camera = FakeCamera(stamps="soe", stamp_offset_ns=offset_ns)
+    source = open_fake(camera, exposure_s=0.004, buffers=16)
+    source.read(1.0)
+    kernel.clock.sleep_until(kernel.clock.now_ns + 15_000_000_000)
+    frames = [source.read(1.0) for _ in range(20)]
+    late_s = [1e-9 * (f.t_arrival_ns - f.t_exposure_mid_ns) for f in frames]
+    assert late_s[0] > 14.0 > 1.0 > late_s[-1]
+    for frame in frames:
+        assert abs(frame.t_exposure_mid_ns - camera.truth[frame.sequence].t_mid_ns) < 1000
+
+
 def test_forced_anchor_overrides_a_lying_flag(open_fake) -> None:
     camera = FakeCamera(stamps="eof", flags=0x12000)  # claims start of exposure
     frame = open_fake(camera, exposure_s=0.004, readout_s=READOUT_S, stamp="eof").read(1.0)
