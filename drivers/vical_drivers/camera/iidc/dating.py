@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from vical_drivers.camera.iidc.cycle_clock import CycleClock, image_cycle_time_ns
+from vical_drivers.camera.iidc.cycle_clock import WRAP_NS, CycleClock, image_cycle_time_ns
 from vical_drivers.camera.iidc.embedded import EmbeddedInfo
 from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.stamps import SIGMA_NS, Anchor, RawStamp
 from vical_drivers.camera.statistics import FrameStatistics
 
 OLDEST_NS = 2_000_000_000
-"""No frame waits longer in the ring."""
+"""No frame waits longer in the ring, unless this process was stopped: then stamps go on from the last."""
 PACKET_STAMP_SIGMA_NS = 36_000
 """The first packet is dated by its bus cycle of 125 us: a uniform error of 125 us / sqrt(12)."""
 
@@ -46,7 +46,10 @@ class FrameDating:
         """
         if info.cycle_time is not None:
             t_ns = self.clock.to_host_ns(image_cycle_time_ns(info.cycle_time))
-            if not 0 <= t_arrival_ns - t_ns < OLDEST_NS:
+            oldest_ns = t_arrival_ns - OLDEST_NS
+            if self._t_last_ns is not None and t_arrival_ns - self._t_last_ns < WRAP_NS:
+                oldest_ns = min(oldest_ns, self._t_last_ns)
+            if not oldest_ns < t_ns <= t_arrival_ns:
                 # exposed before a bus reset gave the bus another time, and read after it
                 self._statistics.count("implausible_stamps")
                 return RawStamp(t_arrival_ns, Anchor.ARRIVAL, None, SIGMA_NS[Anchor.ARRIVAL])
