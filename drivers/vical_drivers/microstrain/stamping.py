@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from vical_drivers.clock import DeviceClock, DeviceTime, SampleCounter
 from vical_drivers.envelope import EnvelopeOptions
 from vical_drivers.microstrain.session import Applied, RawSample
@@ -9,6 +11,7 @@ from vical_drivers.samples import ImuSample
 
 WARM_UP_S = 1.0
 """Samples are held back this long at first: the clock mapping needs some arrivals."""
+_RATE_NS = 5_000_000_000  # the rate of late is that of one to two such times
 _STUCK_SAMPLES = 20
 """So many samples with one and the same device time: the timer stands."""
 
@@ -36,7 +39,7 @@ class SampleStamper:
         self.samples = 0
         self.lost = 0
         self._last_stamp_ns = 0
-        self._span_start_ns = 0
+        self._marks: deque[tuple[int, int]] = deque(maxlen=2)  # a stamp, and how many samples there were then
         self.begin(applied, byte_ns)
 
     def begin(self, applied: Applied, byte_ns: float) -> None:
@@ -45,6 +48,7 @@ class SampleStamper:
         # The device reads its timer, then sends; what the stamp means lies a filter delay earlier.
         self._delay_ns = round(applied.group_delay_s * 1e9 + applied.record_bytes * byte_ns)
         self._span_samples = 0
+        self._marks.clear()
         # Without a time field the samples themselves are the clock: one tick each.
         self._counter = None if applied.tick_hz else SampleCounter(applied.rate_hz)
         self._begin_clock(applied.tick_hz or applied.rate_hz, applied.tick_bits, restarts=0)
@@ -59,11 +63,12 @@ class SampleStamper:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per host second since the connection began; nominal until there are two."""
-        elapsed_ns = self._last_stamp_ns - self._span_start_ns
-        if self._span_samples < 2 or elapsed_ns <= 0:
+        """Samples per host second over the last 5 to 10 s of the connection; nominal until there are two."""
+        if self._span_samples < 2:
             return self._rate_hz
-        return (self._span_samples - 1) * 1e9 / elapsed_ns
+        since_ns, before = self._marks[0]
+        elapsed_ns = self._last_stamp_ns - since_ns
+        return (self._span_samples - before) * 1e9 / elapsed_ns if elapsed_ns > 0 else self._rate_hz
 
     def stamp(self, raw: list[RawSample]) -> list[ImuSample]:
         """Date what one read brought; [] while the mapping warms up."""
@@ -106,9 +111,11 @@ class SampleStamper:
             )  # fmt: skip
         self._held = []
         if not self._span_samples:
-            self._span_start_ns = out[0].t_host_ns
+            self._marks.append((out[0].t_host_ns, 1))
         self._last_stamp_ns = last_ns
         self._span_samples += len(out)
+        if last_ns - self._marks[-1][0] > _RATE_NS:
+            self._marks.append((last_ns, self._span_samples))
         self.samples += len(out)
         return out
 

@@ -5,6 +5,8 @@ later, and from one reading to the next all stamps move by milliseconds. To a fi
 time shift, with motion missing. The device's clock itself is even. So readings are put on an even axis, and
 the step is added to the reported time shift: t_imu = t_cam + shift by the stamps of *now*. Only stamps that
 are even except for such steps are changed; others (taken on arrival) are left alone.
+
+A device may begin to sample at another rate: then all intervals differ from the usual one, and alike.
 """
 
 from __future__ import annotations
@@ -22,6 +24,9 @@ _EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by
 _FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval
 _MOST = 0.55  # of an interval
 _SETTLED = 4  # readings after which a step is one: a single late stamp is followed by a short interval
+_SPREAD = 0.5
+"""Intervals by which drivers make up for a step back, in usual ones: as many in a row as the step needs."""
+_SPREAD_OFF = 0.01  # within this, intervals are such ones
 
 
 @dataclass(slots=True)
@@ -37,6 +42,8 @@ class StampSteps:
     _first: list[float] = field(default_factory=list)
     _period_s: float = 0.0
     _largest_s: float = 0.0
+    _interval_s: float = np.nan
+    _alike: int = 0  # latest intervals that are like the one before, and not like the usual one
     _before_s: float = 0.0  # the total before a step that is not certain yet
     _since: int = 0
     _untold_s: float = 0.0  # steps that are certain, and were not announced
@@ -45,6 +52,7 @@ class StampSteps:
         """Put the stamp of the next reading, s, on the even axis."""
         interval_s, self._last_s = t_s - self._last_s, t_s
         if self._period_s:
+            self._see_rate(interval_s)
             self._follow(interval_s - self._period_s)
         elif interval_s > 0.0:
             self._learn(interval_s)
@@ -56,6 +64,18 @@ class StampSteps:
             self._period_s = float(np.median(self._first))
             self._largest_s = float(np.abs(np.array(self._first) - self._period_s).max())
             self._first.clear()
+
+    def _see_rate(self, interval_s: float) -> None:
+        """Notice another rate; what was taken for steps since it began is taken back."""
+        alike, self._interval_s = abs(interval_s - self._interval_s) < _EVEN_S, interval_s
+        other = interval_s > _LEAST_S <= abs(interval_s - self._period_s)
+        self._alike = self._alike + 1 if alike and other else 0
+        spread = abs(interval_s / self._period_s - _SPREAD) < _SPREAD_OFF
+        if self._alike < (LEARN if spread else _SETTLED):
+            return
+        self._period_s, self._alike = interval_s, 0
+        if self._since:
+            self.total_s, self._since = self._before_s, 0
 
     def _follow(self, deviation_s: float) -> None:
         size_s = abs(deviation_s)

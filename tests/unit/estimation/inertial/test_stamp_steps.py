@@ -88,6 +88,21 @@ def test_missing_readings_are_no_step():
     assert steps.total_s == 0.0
 
 
+@pytest.mark.parametrize("rates_hz", [(100.0, 200.0), (100.0, 125.0), (100.0, 80.0), (500.0, 250.0, 333.3)])
+def test_another_rate_is_no_step(rates_hz):
+    """Each interval was taken for one more step: the time shift was 24 s off after half a minute."""
+    rng = np.random.default_rng(3)
+    t = np.cumsum(np.concatenate([np.full(600, 1.0 / rate_hz) for rate_hz in rates_hz]))
+    t += rng.uniform(-5e-6, 5e-6, len(t))
+    out, steps = followed(t)
+    assert steps.total_s == 0.0 and steps.news() == []
+    assert np.count_nonzero(out != t) <= 20 * (len(rates_hz) - 1)
+    assert np.abs(out - t).max() <= 20 * 0.5 / rates_hz[0] + 1e-4
+    stepped_out, again = followed(stepped(t, len(t) - 100, 3e-4))
+    assert again.total_s == pytest.approx(3e-4, abs=2e-5)  # steps are followed at the new rate, too
+    assert np.abs(stepped_out[-90:] - t[-90:]).max() < 2e-5
+
+
 def test_a_slow_drift_of_the_mapping_is_left_to_the_filter():
     t = np.arange(6000) * 0.01 * (1.0 + 1e-4)
     out, steps = followed(t)
