@@ -24,6 +24,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.outgoing import Message
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import Estimator, status_keys
+from vical_daemon.calibrate.input_trouble import InputTrouble
 from vical_daemon.calibrate.predictions import Predictions
 from vical_daemon.calibrate.publications import (
     calibration_messages,
@@ -31,7 +32,6 @@ from vical_daemon.calibrate.publications import (
     companion_messages,
 )
 from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
-from vical_daemon.calibrate.silence import Silence
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.events import Event
@@ -79,7 +79,7 @@ class EstimateRole:
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._status_keys = status_keys(config.rig)
         rates_hz = {name: config.cameras[name].rate_hz for name in config.calibration_cameras}
-        self._silence = Silence(config.calibration_imu, rates_hz)
+        self._trouble = InputTrouble(config.calibration_imu, rates_hz)
         self._order: ReorderBuffer[ImuMessage | PointsFrame] = ReorderBuffer(config.calibration.lag_s)
         self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
         self._span_ns: tuple[int, int] | None = None  # first and last of all stamps that passed
@@ -97,7 +97,7 @@ class EstimateRole:
                 self._sort_in(sample.key, imu.stamp_ns, imu)
             elif sample.key in self._status_keys:
                 message = decode_diagnostics(sample.payload)
-                self._silence.take(message)
+                self._trouble.take(message)
                 self._stamps_known(message)
             else:
                 self.images += 1
@@ -163,8 +163,8 @@ class EstimateRole:
         if now_s is None:
             now_s = (self._order.newest_ns or 0) * 1e-9
         else:
-            self._silence.look(now_s)
-            self.estimator.do_without(self._silence.cameras)
+            self._trouble.look(now_s)
+            self.estimator.do_without(self._trouble.cameras)
         return self._publications(now_s)
 
     def finish(self) -> list[Message]:
@@ -200,10 +200,10 @@ class EstimateRole:
                 self._images_in_order -= 1
                 images_repeated = self._repeated("images")
                 self.estimator.add_points(item)
-                self._silence.image_came(item.camera, new=self._repeated("images") == images_repeated)
+                self._trouble.image_came(item.camera, new=self._repeated("images") == images_repeated)
                 self._report(self.estimator.process())
         if readings:
-            self._silence.imu_came(new=self._repeated("imu") < repeated + readings)
+            self._trouble.imu_came(new=self._repeated("imu") < repeated + readings)
 
     def _repeated(self, what: str) -> int:
         """Readings (``imu``) or ``images`` so far that were the one before once more."""
@@ -220,7 +220,7 @@ class EstimateRole:
         self._next_s = now_s + self._period_s
         estimate = self.estimator.estimate()
         self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
-        told = {name: self._silence.told(estimate, name) for name in self.config.calibration_cameras}
+        told = {name: self._trouble.told(estimate, name) for name in self.config.calibration_cameras}
         messages = calibration_messages(self.config, told) + self._predictions.messages()
         if now_s >= self._next_companion_s:
             self._next_companion_s = now_s + COMPANION_S
@@ -246,9 +246,9 @@ class EstimateRole:
             "stamp_jumps": str(sum(gate.jumps for gate in self._gates.values())),
             **{name: str(count) for name, count in self.estimator.left_out.items()},
         }
-        status = calibration_status(self.latest, counters | {"silent": ", ".join(self._silence.silent)})
-        if self._silence.silent:
-            text = f"{status.message}; {self._silence.words()}"
+        status = calibration_status(self.latest, counters | {"silent": ", ".join(self._trouble.silent)})
+        if self._trouble.silent:
+            text = f"{status.message}; {self._trouble.words()}"
             status = replace(status, level=max(status.level, Level.WARN), message=text)
         if stuck_s > STUCK_S:
             text = f"stuck: images arrive, none used or refused for {stuck_s:.0f} s"

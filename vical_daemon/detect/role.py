@@ -159,7 +159,7 @@ class DetectRole:
             "of_another_size": str(self.refused),
             "failures": str(self._failures),
             "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
-        }
+        } | ({"wrong_target": self.wrong_target} if self.wrong_target else {})
         if busy_s > STUCK_S:
             text = f"stuck: at one image for {busy_s:.0f} s"
             return DiagnosticStatus(Level.STALE, f"detect/{self.camera}", text, "", values)

@@ -101,7 +101,7 @@ class BoardDetector:
             fix = self._search(gray)
         found = fix is not None and fix.found.sum() >= MIN_POINTS
         if self._check is not None:
-            self._check.take(gray, found=bool(found))
+            self._check.take(gray)
         if fix is None or not found:
             self._last = None
             self._misses += 1

@@ -67,15 +67,12 @@ class TargetCheck:
         self._next = _FIRST
         self._last = ""
 
-    def take(self, gray: Gray, *, found: bool) -> None:
+    def take(self, gray: Gray) -> None:
         """Check an image, if it is one's turn.
 
         Args:
             gray: The image, uint8.
-            found: The board was found in it, or what looks like a part of it.
         """
-        if found and isinstance(self._target, Checkerboard):  # found as a whole
-            self._settled = True
         self._taken += 1
         if self._settled or self._taken < self._next:
             return
@@ -245,8 +242,10 @@ def _ends_in_view(grid: FloatArray, gray: Gray) -> bool:
 
 def _other_counts(gray: Gray, target: Checkerboard) -> str | None:
     found = _board_in_view(gray)
-    if found is None or found == (max(target.cols, target.rows), min(target.cols, target.rows)):
+    if found is None:
         return None
+    if found == (max(target.cols, target.rows), min(target.cols, target.rows)):
+        return ""  # a board of fewer columns or rows is found in it as well
     cols, rows = found if target.cols >= target.rows else found[::-1]
     return (
         f"a checkerboard with {cols} x {rows} inner corners is in view, the target file states "

@@ -104,12 +104,22 @@ def test_two_pictures_must_agree_and_it_is_told_once(film):
     assert counts.index(1) == 2 * target_check._FIRST - 1 and counts[-1] == 1
 
 
+@pytest.mark.parametrize(("cols", "text"), [(7, "8 x 7 inner corners is in view, .* states 7 x 7"), (8, "")])
+def test_fewer_columns_are_told_although_such_a_board_is_found_in_some_images(film, cols, text):
+    """One of ten images of a larger board shows it; after the first of them nothing was checked any more."""
+    told: list[str] = []
+    check, picture = TargetCheck(replace(BOARD, cols=cols), told.append), film(BOARD, 0.7).render(0.0)
+    for _ in range(2 * target_check._FIRST):
+        check.take(picture)
+    assert bool(told) == bool(text) and re.search(text, "".join(told))
+
+
 def test_a_board_that_fits_is_looked_at_once(film, monkeypatch):
     looks: list[int] = []
     monkeypatch.setattr(target_check, "contradiction", lambda *_: looks.append(1) or "")
     check = TargetCheck(GRID, lambda text: pytest.fail(text))
     for _ in range(100):
-        check.take(np.zeros((4, 4), np.uint8), found=True)
+        check.take(np.zeros((4, 4), np.uint8))
     assert len(looks) == 1
 
 
@@ -118,5 +128,5 @@ def test_without_a_board_the_checks_go_on_and_cost_little(monkeypatch):
     monkeypatch.setattr(target_check, "contradiction", lambda *_: looks.append(1))
     check = TargetCheck(GRID, lambda text: pytest.fail(text))
     for _ in range(10_000):
-        check.take(np.zeros((4, 4), np.uint8), found=False)
+        check.take(np.zeros((4, 4), np.uint8))
     assert 65 <= len(looks) <= 90  # a board that comes later is told of within 15 s at 20 Hz

@@ -15,7 +15,7 @@ from vical_daemon.bus.messages import (
     encode_imu,
     encode_points,
 )
-from vical_daemon.calibrate.silence import Silence
+from vical_daemon.calibrate.input_trouble import InputTrouble
 from vical_daemon.calibrate.worker import EstimateRole
 from vical_daemon.config.model import loads
 from vical_daemon.estimation.calibrator import Calibrator
@@ -54,9 +54,9 @@ class Rig:
             1, self.status, "", 1.0, "turn", 1.0, 2, 3, {"cam0": KNOWN}, None, [], 1.0, 0.0, [], MOVE
         )
 
-    def say(self, name: str, level: Level, message: str) -> None:
+    def say(self, name: str, level: Level, message: str, **values: str) -> None:
         role = name.partition("/")[0]
-        payload = encode_diagnostics(0, role, [DiagnosticStatus(level, name, message)])
+        payload = encode_diagnostics(0, role, [DiagnosticStatus(level, name, message, values=values)])
         self.role.take(Sample(topics.STATUS.key("rover", role), payload, 0))
 
     def run(
@@ -122,23 +122,34 @@ def test_a_camera_that_is_not_connected_is_named_on_its_own_topic_alone() -> Non
     assert not rig.without
 
 
+@pytest.mark.parametrize("status", [Status.WAITING, Status.CONVERGED])
+def test_a_target_file_that_is_wrong_is_named_where_people_look(status: Status) -> None:
+    """Beside "the target has not been seen yet: show the whole board", nobody looks at the target file."""
+    rig, text = Rig(), "AprilTags are in view, the target file states a checkerboard"
+    rig.status = status
+    rig.say("detect/cam0", Level.ERROR, text, wrong_target=text)
+    sent = rig.run(1.0)
+    assert (sent["cam0"].status, sent["cam0"].reason, sent["cam0"].guidance) == (status, text, "turn")
+    assert sent["cam1"].reason == ""
+
+
 def test_what_waits_in_the_queue_of_a_busy_estimator_is_not_missing() -> None:
-    silence = Silence("imu0", {"cam0": 10.0})
-    silence.look(0.0)
-    silence.imu_came(new=True)
-    silence.image_came("cam0", new=True)
-    silence.look(60.0)  # one step took a minute
-    assert not silence.silent
+    trouble = InputTrouble("imu0", {"cam0": 10.0})
+    trouble.look(0.0)
+    trouble.imu_came(new=True)
+    trouble.image_came("cam0", new=True)
+    trouble.look(60.0)  # one step took a minute
+    assert not trouble.silent
 
 
 def test_a_slow_camera_is_silent_after_five_of_its_intervals() -> None:
-    silence = Silence("imu0", {"cam0": 0.5})
+    trouble = InputTrouble("imu0", {"cam0": 0.5})
     for now_s in range(12):
-        silence.look(float(now_s))
-        silence.imu_came(new=True)
-    assert list(silence.silent) == ["camera/cam0"]
-    silence.image_came("cam0", new=True)
+        trouble.look(float(now_s))
+        trouble.imu_came(new=True)
+    assert list(trouble.silent) == ["camera/cam0"]
+    trouble.image_came("cam0", new=True)
     for now_s in range(12, 21):
-        silence.look(float(now_s))
-        silence.imu_came(new=True)
-    assert not silence.silent
+        trouble.look(float(now_s))
+        trouble.imu_came(new=True)
+    assert not trouble.silent

@@ -1,8 +1,8 @@
-"""Which devices deliver nothing new, for how long, and why. No I/O, no clock.
+"""What the estimator cannot see of its input: devices that deliver nothing new, a target file that is wrong.
 
 A calibration stays what it is while its devices are gone: `converged` says how well it is known, not that
 data arrive. So that nobody takes an old estimate for one that is being followed, its reason says what is
-missing.
+missing. No I/O, no clock.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ _TURN_S = 1.0
 """At most so much of the time between two looks counts, s: the estimator may have been busy for longer, and
 what arrived meanwhile still waits in the queue."""
 _PERIODS = 5.0  # a slow camera is silent after so many intervals
+WRONG_TARGET = "wrong_target"
+"""Value of a detector's status: what its images contradict in the target file, one line."""
 _NOTHING_YET = (Status.WAITING, Status.INITIALISING)
 
 
@@ -39,7 +41,7 @@ class _Device:
     repeats: bool = False
 
 
-class Silence:
+class InputTrouble:
     """Follows what comes from the devices of one calibration.
 
     Args:
@@ -53,6 +55,7 @@ class Silence:
         for name, rate_hz in camera_rates_hz.items():
             self._devices[f"camera/{name}"] = _Device(max(FRESH_S, _PERIODS / rate_hz))
         self._said: dict[str, str] = {}  # what is wrong with a device or its detector, by name
+        self._wrong_target: dict[str, str] = {}  # what images contradict in the target file, by camera
         self._looked_s: float | None = None
 
     def imu_came(self, *, new: bool) -> None:
@@ -76,6 +79,8 @@ class Silence:
         for status in message.statuses:
             bad = status.level > Level.OK
             self._said[status.name] = status.message if bad else ""
+            if WRONG_TARGET in status.values:
+                self._wrong_target[status.name.partition("/")[2]] = status.values[WRONG_TARGET]
 
     def look(self, now_s: float) -> None:
         """Let time pass, by a steady clock, s."""
@@ -113,16 +118,17 @@ class Silence:
         return f"{line}: {why}" if why else line
 
     def told(self, estimate: CalibrationEstimate, camera: str) -> CalibrationEstimate:
-        """Return an estimate as it is published for one camera, with what is missing of its devices.
+        """Return an estimate as it is published for one camera, with the trouble of its input.
 
-        What the status says of a calibration stands. It asks for no motion, which would not be seen. A camera
-        of which nothing is known waits, whatever is known of the others.
+        What the status says of a calibration stands. While something is missing no motion is asked for, which
+        would not be seen. A camera of which nothing is known waits, whatever is known of the others.
         """
-        words = self.words((self._imu, f"camera/{camera}"))
-        if not words:
+        missing = self.words((self._imu, f"camera/{camera}"))
+        wrong = self._wrong_target.get(camera, "")
+        if not missing and not wrong:
             return estimate
         if camera not in estimate.cameras and camera in self.cameras:
             estimate = replace(estimate, status=Status.WAITING, progress=0.0)
         reason = "" if estimate.status in _NOTHING_YET else estimate.reason
-        reason = "; ".join(filter(None, (words, reason)))
-        return replace(estimate, reason=reason, guidance="", next_motion=Guidance())
+        estimate = replace(estimate, reason="; ".join(filter(None, (missing, wrong, reason))))
+        return replace(estimate, guidance="", next_motion=Guidance()) if missing else estimate
