@@ -10,6 +10,9 @@ from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, WeakDirection
 from vical_daemon.estimation.wording import direction_document, event_document, guidance_document
 
+NEARLY = 0.95
+"""Progress of what has not converged, at most."""
+
 
 class Status(StrEnum):
     """Where a calibration stands."""

@@ -121,13 +121,18 @@ def fault_headline(component: str, age_s: float | None = None) -> str:
         component: Its name.
         age_s: How long ago its last data came, s; None: not known, or there were none.
     """
-    since = "" if age_s is None or age_s < 1.0 else f": no data for {age_s:.0f} s"
+    since = "" if age_s is None or age_s < 1.0 else f": no data for {age_s:.0f}\N{NO-BREAK SPACE}s"
     return f"{component} does not work{since}."
 
 
 def silent_headline(component: str) -> str:
     """Say in one short sentence that nothing new comes from a device which reports no error."""
     return f"{component} delivers nothing new."
+
+
+def at_rest(status: str) -> str:
+    """Say in one short sentence where a calibration stands while nothing new comes from its devices."""
+    return f"{status}, at rest until data come."
 
 
 def silence(age_s: float) -> str:

@@ -160,6 +160,7 @@ def picture_event(sight: Sight) -> bytes | None:
     document = {
         "stamp_s": round(sight.stamp_ns * 1e-9, 3),
         "size": [pixels.shape[1], pixels.shape[0]],
+        "searched": points is not None,
         "detected": _rows(points),
         "predicted": _rows(predicted),
         "light": brightness,

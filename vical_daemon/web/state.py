@@ -28,6 +28,7 @@ from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.estimation.measurements import ConvergenceTargets
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.wording import (
+    at_rest,
     direction_warning,
     event_document,
     fault_headline,
@@ -210,6 +211,8 @@ class WebState:
             fault = self._fault(name)
             entry = summary(camera.latest, now_s - camera.arrived_s, fault is not None)
             entry["fault"] = fault
+            if self._silent(name) and not entry["stale"]:
+                entry["headline"] = at_rest(entry["status"])
             entry["events"] = [event_document(event) for event in camera.events]
             entry |= self._result(name, camera.latest)
             if fault is None and not entry["stale"]:
@@ -299,14 +302,17 @@ class WebState:
         for status in statuses:
             if status.level >= Level.ERROR and _concerns(status.name, camera):
                 return fault_document(status)
-        for status in statuses:
-            silent = filter(None, status.values.get("silent", "").split(", "))
-            name = next((name for name in silent if _concerns(name, camera)), "")
-            if name:
-                shown = self._cameras.get(camera)
-                message = status.message if shown is None else shown.latest.estimate.reason
-                return {"name": name, "headline": silent_headline(name), "message": message}
+        for name in self._silent(camera):
+            shown = self._cameras.get(camera)
+            message = "" if shown is None else shown.latest.estimate.reason
+            return {"name": name, "headline": silent_headline(name), "message": message}
         return None
+
+    def _silent(self, camera: str) -> list[str]:
+        """Components from which the estimator gets nothing new, of those on which a camera depends."""
+        values = [status.values for _, said in self._statuses.values() for status in said]
+        names = [name for v in values for name in v.get("silent", "").split(", ") if name]
+        return [name for name in names if _concerns(name, camera)]
 
 
 def _concerns(component: str, camera: str) -> bool:

@@ -264,7 +264,7 @@ def test_a_fault_of_another_camera_takes_no_advice_away(bus, state, web_feed):
     gone = DiagnosticStatus(Level.ERROR, "camera/cam1", "no such device", values=values)
     bus.publish(topics.STATUS.key("rig0", "camera"), encode_diagnostics(0, "camera", [gone]))
     document = state.tick()
-    assert document["fault"]["headline"] == "camera/cam1 does not work: no data for 12 s."
+    assert document["fault"]["headline"] == "camera/cam1 does not work: no data for 12\N{NO-BREAK SPACE}s."
     entry = document["cameras"]["cam0"]
     assert entry["fault"] is None and entry["guidance"] and entry["motion"]["rotate"] == ["x"]
 
@@ -277,6 +277,7 @@ def test_a_device_that_repeats_itself_is_a_fault_though_it_reports_none(bus, sta
     bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [silent]))
     fault = state.tick()["cameras"]["cam0"]["fault"]
     assert fault["headline"] == "camera/cam0 delivers nothing new." and fault["message"] == reason
+    assert state.tick()["cameras"]["cam0"]["headline"] == "converged, at rest until data come."
     spoken = replace(silent, values={"silent": ""})
     bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [spoken]))
     assert state.tick()["cameras"]["cam0"]["fault"] is None

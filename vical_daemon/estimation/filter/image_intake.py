@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.imu_buffer import GAP_PERIODS
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
+from vical_daemon.estimation.result import NEARLY, CalibrationEstimate, Status, TracePoint
 
 SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
@@ -220,7 +220,8 @@ def by_present_stamps(
     estimated = any(e.timeshift_sigma_s for e in estimate.cameras.values())
     if estimate.status is Status.CONVERGED and estimated and stamp_sigma_s > limit_s:
         reason = f"stamps are known to {1e3 * stamp_sigma_s:.1f} ms only, by how they arrive"
-        estimate = replace(estimate, status=Status.CONVERGING, reason=reason)
+        progress = min(estimate.progress, NEARLY)
+        estimate = replace(estimate, status=Status.CONVERGING, reason=reason, progress=progress)
     cameras = {
         name: replace(
             e,

@@ -16,6 +16,7 @@ from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.model.unscented import RIDGE
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
+    NEARLY,
     CalibrationEstimate,
     CameraEstimate,
     ImuEstimate,
@@ -259,7 +260,7 @@ class Evaluator:
         if not known:
             return min(0.1, 0.001 * self.frames_seen)
         worst = max((direction.excess for direction in weak), default=1.0)
-        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, NEARLY))
 
 
 def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:

@@ -139,7 +139,7 @@ function drawWords() {
   setText("status", fault ? "fault" : status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
   document.querySelector(".say").classList.toggle("converged", status === "converged");
   document.querySelector(".say").classList.toggle("fault", Boolean(fault));
-  const headline = latest ? latest.headline : "No estimate yet: is the calibrate process running?";
+  const headline = latest ? latest.headline : "No estimate yet: the calibrate process is starting, or it does not run.";
   setText("headline", fault ? fault.headline : headline);
   setText("guidance", fault ? fault.message : latest ? latest.guidance : "");
   setText("reason", fault ? `Calibration: ${headline}` : latest ? latest.reason : "");
@@ -221,9 +221,12 @@ function drawSight() {
   const quiet = faultOf(latest) || !latest || latest.stale || (latest.status === "converged" && !latest.guidance);
   camera.coverage = sight ? sight.coverage : null;
   camera.setWanted(sight && sight.wanted && !quiet ? sight.wanted : null);
-  meters.sight(sight, camera.last && camera.last.light);
+  const fault = faultOf(latest), gone = Boolean(fault) && fault.name === `camera/${page.camera}`;
+  camera.setGone(gone);
+  meters.sight(gone ? null : sight, gone ? null : camera.last && camera.last.light);
   meters.draw(latest && latest.meters ? latest.meters : []);
   drawStored(latest ? latest.stored : null);
+  document.querySelector(".space").hidden = !(latest && latest.rig); // nothing to draw yet
   const path = page.paths[page.camera] || [], board = sight && sight.board;
   if (latest && latest.rig) scene.set({ rig: latest.rig, board: board || undefined, path: board && path.length ? path : undefined });
   for (const button of document.querySelectorAll("button[data-room='1']")) button.disabled = !(board && path.length);

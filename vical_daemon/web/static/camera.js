@@ -10,6 +10,7 @@ class CameraScreen {
     this.number = 0;
     this.shownAt = 0;
     this.coverage = null; // {columns, rows, count, rms_px}, of the whole image
+    this.gone = false; // the camera delivers nothing: what is shown is old
     this.wanted = null; // {outline, text}: where the board is to be brought
     setInterval(() => this.watchAge(), 1000);
     for (const id of ["show-detected", "show-predicted", "show-coverage"]) this.byId(id).onchange = () => this.draw();
@@ -44,7 +45,7 @@ class CameraScreen {
     this.last = picture;
     this.shownAt = performance.now();
     this.draw();
-    document.querySelector(".screen").classList.add("live");
+    if (!this.gone) document.querySelector(".screen").classList.add("live");
   }
 
   watchAge() { // a picture that stands still looks like a rig that stands still
@@ -52,6 +53,14 @@ class CameraScreen {
     if (!this.last || age < 5) return;
     document.querySelector(".screen").classList.remove("live");
     this.byId("nopicture").textContent = `no new picture for ${age.toFixed(0)} s`;
+  }
+
+  setGone(gone) {
+    this.gone = gone;
+    if (!gone || !this.last || performance.now() - this.shownAt >= 5000) return;
+    document.querySelector(".screen").classList.remove("live");
+    this.byId("nopicture").textContent = "no new picture";
+    setText("misfit", "");
   }
 
   draw() {
@@ -113,6 +122,7 @@ class CameraScreen {
   }
 
   misfit(detected, predicted) {
+    if (!this.last.searched) return "this image was skipped by the detector";
     if (!detected.length) return "no corners found in this image";
     if (!predicted.length) return `${detected.length} corners; no prediction yet`;
     const found = new Map(detected.map(([id, u, v]) => [id, [u, v]]));

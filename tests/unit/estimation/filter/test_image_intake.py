@@ -173,4 +173,5 @@ def test_nothing_has_converged_while_the_stamps_are_known_worse(shift_sigma_s, s
     )
     shown = by_present_stamps(known, {"cam0": 0.0}, stamp_sigma_s, limit_s=5e-4)
     assert shown.status is status
+    assert (shown.progress == 1.0) == (status is Status.CONVERGED)  # "converging 100 %" puzzles
     assert ("known to 5.4 ms" in shown.reason) == (status is Status.CONVERGING)
