@@ -173,7 +173,8 @@ def test_commands_of_the_other_mode_are_refused_while_calibrating(running, word)
 
 
 @pytest.mark.parametrize("word", ["accept", "discard", "reset"])
-def test_commands_of_the_other_mode_are_refused_while_verifying(word):
+def test_commands_of_the_other_mode_are_refused_while_verifying(word, monkeypatch):
+    monkeypatch.setattr(command, "_BUSY_S", 0.05)  # that nobody answers takes a minute to tell
     bus = LocalBus()
     status = [DiagnosticStatus(Level.OK, "estimate", "verify: resting")]
     bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(1, "estimate", status))
