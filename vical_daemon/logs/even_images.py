@@ -253,21 +253,21 @@ def _grid_of(
 
 def _slots(t_s: FloatArray, period_s: float) -> IntArray:
     """Number on the grid of each image of one piece, shape (n,), strictly increasing."""
-    slots = np.zeros(len(t_s), np.int64)
-    late_s = np.zeros(len(t_s))
+    times = t_s.tolist()  # each place follows from those before: arrays would take three times as long
+    slots, late_s = [0] * len(times), [0.0] * len(times)
 
     def place(k: int, earliest_s: float, before: float) -> None:
-        slots[k] = min(np.floor((t_s[k] - earliest_s) / period_s + 1.0 - _SLOT), before)
-        late_s[k] = t_s[k] - slots[k] * period_s
+        slots[k] = int(min(math.floor((times[k] - earliest_s) / period_s + 1.0 - _SLOT), before))
+        late_s[k] = times[k] - slots[k] * period_s
 
-    for k in range(len(t_s)):
-        place(k, late_s[max(k - _BLOCK, 0) : k].min() if k else t_s[0], np.inf)
+    for k in range(len(times)):
+        place(k, min(late_s[max(k - _BLOCK, 0) : k]) if k else times[0], math.inf)
     # The first ones may all have been late, and a late image takes the place before the next one.
-    for k in range(len(t_s) - 2, -1, -1):
+    for k in range(len(times) - 2, -1, -1):
         behind = late_s[k + 1 : k + 1 + _BLOCK]
-        earliest_s = behind.min() if len(behind) == _BLOCK else late_s[max(k - _BLOCK, 0) : k + 1].min()
-        place(k, earliest_s, slots[k + 1] - 1)
-    return slots
+        about = behind if len(behind) == _BLOCK else late_s[max(k - _BLOCK, 0) : k + 1]
+        place(k, min(about), slots[k + 1] - 1)
+    return np.array(slots, dtype=np.int64)
 
 
 def _period_s(t_s: FloatArray, slots: IntArray, bounds: list[int], period_s: float) -> float:
