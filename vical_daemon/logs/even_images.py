@@ -343,4 +343,5 @@ def _errors_px(uv_px: FloatArray, weights: FloatArray) -> FloatArray:
     """
     others = np.concatenate([uv_px[:2], uv_px[3:]]).reshape(4, -1)
     error = uv_px[2] - (weights @ others).reshape(len(weights), -1, 2)
-    return np.asarray(np.median(np.hypot(error[..., 0], error[..., 1]), axis=1))
+    sizes, n = np.sort(np.hypot(error[..., 0], error[..., 1]), axis=1), error.shape[1]
+    return np.asarray(0.5 * (sizes[:, (n - 1) // 2] + sizes[:, n // 2]))  # numpy's takes five times as long
