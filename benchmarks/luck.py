@@ -57,17 +57,18 @@ def draw_of(run: SimulatedRun) -> Draw:
 
 def _pushes(run: SimulatedRun, t_s: FloatArray) -> FloatArray:
     """How far the readings, integrated from the true state of each frame, miss that of the next one."""
-    missed = Missed(run)
-    return np.array([_push(run, missed, begin, end) for begin, end in pairwise(t_s)])
+    missed, steps = Missed(run), [steps_in(gap_s) for gap_s in np.diff(t_s)]
+    middles_s = [begin + h * (np.arange(n) + 0.5) for begin, (h, n) in zip(t_s[:-1], steps, strict=True)]
+    slopes = error_slopes(run.rig, np.concatenate(middles_s))[:, :STATE, :STATE]
+    each = np.split(slopes, np.cumsum([count for _, count in steps])[:-1])
+    return np.array([_push(run, missed, *ends, F) for ends, F in zip(pairwise(t_s), each, strict=True)])
 
 
-def _push(run: SimulatedRun, missed: Missed, begin_s: float, end_s: float) -> FloatArray:
+def _push(run: SimulatedRun, missed: Missed, begin_s: float, end_s: float, slopes: FloatArray) -> FloatArray:
     rig, step_s, count = run.rig, *steps_in(end_s - begin_s)
     gathered = np.diff(missed.until(begin_s + step_s * np.arange(count + 1)), axis=0)
     biases = [np.concatenate([b.value(t) for b in (rig.gyro_bias, rig.accel_bias)]) for t in (begin_s, end_s)]
     gathered -= biases[0] * step_s  # the estimator takes them as constant from frame to frame
-    middles_s = begin_s + step_s * (np.arange(count) + 0.5)
-    slopes = error_slopes(rig, middles_s)[:, :STATE, :STATE]
     off = np.zeros(STATE)
     for F, e in zip(slopes, gathered, strict=True):
         a = F * step_s
