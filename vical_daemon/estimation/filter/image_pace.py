@@ -14,7 +14,7 @@ from collections import deque
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.white_noise import measured_noise
+from vical_daemon.estimation.inertial.white_noise import measured_gyro_density
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.rates import RATE_BLOCK_S
 
@@ -67,7 +67,7 @@ def interval_s(noise: ImuNoise, rate_change_rps2: float, buffer: ImuBuffer) -> f
     rows = buffer.rows
     if len(rows) < 2:
         return 0.0
-    density = measured_noise(noise, rows).gyro_density ** 2
+    density = measured_gyro_density(noise, rows) ** 2
     reading_s = float(rows[-1, 0] - rows[0, 0]) / (len(rows) - 1)
     # less the noise of two means, three axes
     change = rate_change_rps2**2 - 6.0 * density / RATE_BLOCK_S**3

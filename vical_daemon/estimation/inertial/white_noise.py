@@ -24,6 +24,7 @@ _BANDS = 4  # parts of the upper half of the spectrum that are compared
 _MORE = 1.5
 """Times what a start shows: later motion may be rougher. EuRoC has up to 1.2 times the noise of its first 3 s
 as a whole."""
+_GYRO, _ACCEL = slice(1, 4), slice(4, 7)  # columns of readings
 _FLAT = 2.0  # ratio of the largest to the smallest density of them
 
 
@@ -43,6 +44,11 @@ def measured_noise(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
         stated.accel_walk,
         stated.rate_hz,
     )
+
+
+def measured_gyro_density(stated: ImuNoise, rows: FloatArray) -> float:
+    """Return the gyro's density of `measured_noise` alone, rad/s/sqrt(Hz)."""
+    return _within(stated.gyro_density, _of_sensor(rows, _GYRO))
 
 
 def _within(stated: float, measured: float | None) -> float:
@@ -73,15 +79,15 @@ def white_noise(rows: FloatArray) -> tuple[float | None, float | None]:
     Returns:
         None for a spectrum that is not flat, and for too few readings without a gap.
     """
+    return _of_sensor(rows, _GYRO), _of_sensor(rows, _ACCEL)
+
+
+def _of_sensor(rows: FloatArray, columns: slice) -> float | None:
+    """Density of one sensor, see `white_noise`."""
     if len(rows) < _LENGTH:
-        return None, None
-    step_s = float(np.median(np.diff(rows[:, 0])))
-    gyro, accel = (_of_sensor(rows[:, 0], rows[:, k : k + 3], step_s) for k in (1, 4))
-    return gyro, accel
-
-
-def _of_sensor(t_s: FloatArray, values: FloatArray, step_s: float) -> float | None:
-    """Density of one sensor; arguments: times, s, shape (n,), readings, shape (n, 3), usual interval, s."""
+        return None
+    t_s, values = rows[:, 0], rows[:, columns]
+    step_s = float(np.median(np.diff(t_s)))
     first = max(_LENGTH // 4, math.ceil(_MOTION_HZ * step_s * _LENGTH)) + 1
     # a gap, or a reading that was written twice: the sensor measures less often than it is read
     broken = (np.diff(t_s) > _EVEN * step_s) | (np.diff(values, axis=0) == 0.0).all(axis=1)

@@ -15,7 +15,8 @@ from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.robust import MOST_STEPS
 
 _PATCHES = (8, 6)  # across and down: a lens is close to its linearisation within each
-_NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
+_NEWTON_DONE = 1e-9
+"""Step in normalised units (focal lengths), a millionth of a pixel. What is left after it is its square."""
 
 
 def unproject(
@@ -152,7 +153,7 @@ def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArr
             error = np.abs(step).max(axis=-1)
             if not np.any(error > _NEWTON_DONE):
                 break
-        ok = (error < 1e-9) & (np.hypot(xy[..., 0], xy[..., 1]) < limit) & (det > 0.0)
+        ok = (error <= _NEWTON_DONE) & (np.hypot(xy[..., 0], xy[..., 1]) < limit) & (det > 0.0)
     return np.where(ok[..., None], xy, np.nan), ok
 
 
@@ -173,5 +174,5 @@ def _undistort_theta(theta_d: FloatArray, D: FloatArray) -> tuple[FloatArray, Bo
             error = np.abs(step)
             if not np.any(error > _NEWTON_DONE):
                 break
-        ok = (error < 1e-9) & (slope > 0.0) & (theta >= 0.0) & (theta < np.pi)
+        ok = (error <= _NEWTON_DONE) & (slope > 0.0) & (theta >= 0.0) & (theta < np.pi)
     return np.where(ok, theta, np.nan), ok

@@ -28,7 +28,7 @@ def limit(camera: CameraState) -> FloatArray:
 
     A number that no patch shows gets 0: a lens that is far off may have rays for hardly any of them.
     """
-    return np.asarray(SYSTEMATIC_PX * np.linalg.norm(np.linalg.pinv(patches(camera)), axis=1))
+    return np.asarray(SYSTEMATIC_PX * _by_one_px(*_rounded(camera)))
 
 
 def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
@@ -38,12 +38,22 @@ def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
         camera: Its lens counts.
         seen: Patches that are left out count next to nothing, shape (48,); None: all count.
     """
-    K = tuple(float(f"{x:.3g}") for x in camera.intrinsics.tolist())
-    D = tuple(round(x, 3) for x in camera.distortion.tolist())
-    by = _slopes(K, D, camera.distortion_model, camera.resolution)
+    by = _slopes(*_rounded(camera))
     if seen is not None:
         by = np.where(seen[:, None, None], by, _UNSEEN * by)
     return np.asarray(np.linalg.qr(by.reshape(-1, by.shape[-1]))[1])
+
+
+def _rounded(camera: CameraState) -> tuple[Numbers, Numbers, str, tuple[int, int]]:
+    K = tuple(float(f"{x:.3g}") for x in camera.intrinsics.tolist())
+    D = tuple(round(x, 3) for x in camera.distortion.tolist())
+    return K, D, camera.distortion_model, camera.resolution
+
+
+@lru_cache(maxsize=64)
+def _by_one_px(K: Numbers, D: Numbers, model: str, resolution: tuple[int, int]) -> FloatArray:
+    by = _slopes(K, D, model, resolution)
+    return np.asarray(np.linalg.norm(np.linalg.pinv(by.reshape(-1, by.shape[-1])), axis=1))
 
 
 @lru_cache(maxsize=64)

@@ -330,7 +330,7 @@ class Bundle:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
-        inertial, jitter_s, alike = links_left(w, self.problem.noise.jitter_s, order, np.tril(root))
+        inertial, jitter_s, alike = links_left(w, self.problem.noise.jitter_s, order, root)
         good = ok & (np.vecdot(e, e) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])

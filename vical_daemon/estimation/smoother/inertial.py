@@ -128,7 +128,7 @@ def links_left(window: Window, jitter_s: float, order: Order, root: FloatArray) 
         window: Adjusted.
         jitter_s: Jitter that was allowed for.
         order: Places of the unknowns.
-        root: Lower Cholesky factor of the normal matrix.
+        root: Lower Cholesky factor of the normal matrix; what is above its diagonal does not count.
     """
     e, J = link_errors(window)
     if not jitter_s:

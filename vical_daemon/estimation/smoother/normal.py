@@ -143,7 +143,7 @@ class Problem:
             R = w.R[frame] @ so3.exp(rates * late[:, None] + half * alpha[frame])
             p = w.p[frame] + w.v[frame] * late[:, None] + half * accel[frame]
         else:
-            R = (w.R @ so3.exp(rates * late[:, None]))[seen.frame]
+            R = np.take(w.R @ so3.exp(rates * late[:, None]), seen.frame, axis=0)
             p = (w.p + w.v * late[:, None])[seen.frame]
             rates = rates[seen.frame]
         marks = w.landmarks
@@ -186,11 +186,10 @@ class Problem:
         J = np.empty((len(view.uv), 2, _CONSTANTS + layout.size - layout.dynamic + 1))
         Jy = view.by_point * whitening[:, None, None]
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
-        # by the point in the world; copied, as the product of views takes three times as long
-        JW = JR @ np.ascontiguousarray(np.swapaxes(view.R, 1, 2))
+        JW = np.matvec(view.R[:, None], JR)  # by the point in the world
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
-        J[:, :, :2] = JW @ tangents(marks.bearing)[seen.landmark]
-        J[:, :, 2] = np.matmul(JW, away[:, :, None])[..., 0] - JR @ cam.p_imu_cam
+        J[:, :, :2] = JW @ np.take(tangents(marks.bearing), seen.landmark, axis=0)
+        J[:, :, 2] = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
         J[:, :, 3:6] = so3.cross(JR, view.x_imu[:, None])
         J[:, :, 6:9] = -rho * JW
         by_shift = self._by_shift(view, JR)
@@ -219,7 +218,7 @@ class Problem:
         rho = self.window.landmarks.inverse[seen.landmark]
         forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], view.R)  # speed in the imu frame
         moved = so3.cross(view.x_imu, view.rates) - rho[:, None] * forward
-        return np.asarray(np.matmul(JR, moved[:, :, None])[..., 0])
+        return np.asarray(np.einsum("nij,nj->ni", JR, moved))
 
     def pixels_late(self, view: View) -> tuple[FloatArray, FloatArray]:
         """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""

@@ -14,7 +14,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.filter.jump_scores import Corrected, Moved
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.target_poses import attitude_sigmas, poses_of
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, poses_of
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import State
@@ -33,6 +33,9 @@ _STRETCHES = (10, 15, 30)  # images in which a step is looked for
 _LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
 _BEFORE_IMAGES = 30  # that show how well orientations usually fit
 _MOST = 200  # images kept, a camera
+
+_Poses = dict[float, TargetPose | None]
+"""Poses of a camera by the stamps of its images, s; None: the image shows none."""
 
 
 class Taken(NamedTuple):
@@ -98,10 +101,11 @@ class RecentPast:
         Nobody knows when it stepped: the shortest stretch that gives an answer is as good as any.
         """
         frames = [(t, frame) for t, frame, _ in self._frames.get(camera, ())]
+        poses: _Poses = {}
         for count in _STRETCHES:
             if len(frames) < count:
                 break
-            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target)
+            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target, poses)
             if fit is not None and fit.stepped:
                 return fit
         return None
@@ -131,7 +135,7 @@ class RecentPast:
         """
         newer = self.images()
         own = [(t, frame) for t, frame in newer if frame.camera == camera]
-        seen = _orientations(own, f, target)
+        seen = _orientations(own, f, target, {})
         if seen is None or len(buffer) < 2:
             return []
         curve, known = _curve(buffer, f), f.state.cameras
@@ -148,6 +152,7 @@ class RecentPast:
         f: CalibrationFilter,
         buffer: ImuBuffer,
         target: FloatArray,
+        poses: _Poses | None = None,
     ) -> ShiftFit | None:
         """Whether images of one camera fit the gyro at one time shift, and only there.
 
@@ -156,14 +161,16 @@ class RecentPast:
             f: With the calibration as it is known.
             buffer: Inertial readings.
             target: Points of the target, m, shape (n, 3).
+            poses: Of images looked at before, with the same lens; others are added.
         """
-        seen = _orientations(frames, f, target)
+        poses = {} if poses is None else poses
+        seen = _orientations(frames, f, target, poses)
         if seen is None or len(buffer) < 2:
             return None
         curve, known = _curve(buffer, f), f.state.cameras[frames[0][1].camera]
         used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
         sound_s = min(frames[0][0], f.state.t_s - known.timeshift_s)
-        before = _orientations([x for x in used if x[0] < sound_s][-_BEFORE_IMAGES:], f, target)
+        before = _orientations([x for x in used if x[0] < sound_s][-_BEFORE_IMAGES:], f, target, poses)
         level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
 
@@ -173,16 +180,20 @@ def _curve(buffer: ImuBuffer, f: CalibrationFilter) -> GyroCurve:
     return GyroCurve.integrate(buffer.rows[:, 0], buffer.rows[:, 1:4], f.state.gyro_bias)
 
 
-def _orientations(frames: Frames, f: CalibrationFilter, target: FloatArray) -> Orientations | None:
+def _orientations(
+    frames: Frames, f: CalibrationFilter, target: FloatArray, poses: _Poses
+) -> Orientations | None:
     """What the camera's orientations are by the target alone; None where no image shows one."""
     if not frames:
         return None
     known = f.state.cameras[frames[0][1].camera]
-    poses = [p for p in poses_of(frames, known, target) if p is not None]
-    if not poses:
+    new = [(t, frame) for t, frame in frames if t not in poses]
+    poses.update(zip((t for t, _ in new), poses_of(new, known, target), strict=True))
+    shown = [p for p in (poses[t] for t, _ in frames) if p is not None]
+    if not shown:
         return None
     return Orientations(
-        np.array([p.t_cam_s for p in poses]),
-        np.array([p.R_target_cam for p in poses]),
-        attitude_sigmas(poses, known),
+        np.array([p.t_cam_s for p in shown]),
+        np.array([p.R_target_cam for p in shown]),
+        attitude_sigmas(shown, known),
     )

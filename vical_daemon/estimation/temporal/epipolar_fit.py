@@ -11,12 +11,13 @@ fitted along: a turn by a known angle moves a feature by a length in pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, IntArray
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
@@ -148,12 +149,13 @@ class _Fit:
 
     def _rays(self) -> None:
         p, lens = self.pairs, (self.intrinsics, self.distortion, self.model)
-        self.a, ok_a = unproject(p.uv_1, *lens)
-        self.b, ok_b = unproject(p.uv_2, *lens)
-        self.ok: BoolArray = ok_a & ok_b
-        self.a, self.b = (np.where(self.ok[:, None], r, [0.0, 0.0, 1.0]) for r in (self.a, self.b))
+        rays, ok = unproject(p.uv, *lens)
+        rays = np.where(ok[:, None], rays, [0.0, 0.0, 1.0])
+        self.a, self.b = (np.take(rays, at, axis=0) for at in (p.at_1, p.at_2))
+        self.ok: BoolArray = ok[p.at_1] & ok[p.at_2]
         if self.fit_lens:
-            self.dray = [self._ray_change(rays) for rays in (self.a, self.b)]
+            change = self._ray_change(rays)
+            self.dray = [np.take(change, at, axis=0) for at in (p.at_1, p.at_2)]
 
     def _ray_change(self, rays: FloatArray) -> FloatArray:
         """D ray / d (fx fy cx cy, distortion) for a fixed pixel, shape (n, 3, 4 + coefficients).
@@ -254,22 +256,21 @@ class _Fit:
         dR = np.swapaxes(A1, 1, 2) @ A2
         R12 = R.T @ dR @ R
         usable = (inside[p.first] & inside[p.second])[p.of] & self.ok
-        b = np.matvec(R12[p.of], self.b)
+        b = np.matvec(np.take(R12, p.of, axis=0), self.b)
         n = so3.cross(self.a, b) * usable[:, None]
-        M = np.add.reduceat(n[:, :, None] * n[:, None, :], p.begin)
-        vectors = np.linalg.eigh(M)[1]
-        d, Bt = vectors[:, :, 0][p.of], vectors[:, :, 1:][p.of]
+        vectors = np.linalg.eigh(_products(n, n, p.begin))[1]
+        d, Bt = (np.take(part, p.of, axis=0) for part in (vectors[:, :, 0], vectors[:, :, 1:]))
         ta, tb = so3.cross(d, self.a), so3.cross(d, b)
-        length = np.sqrt((ta**2).sum(-1) + (tb**2).sum(-1)) + 1e-6
-        e = np.where(usable, (d * n).sum(-1) / length, 0.0)
+        length = np.sqrt(np.vecdot(ta, ta) + np.vecdot(tb, tb)) + 1e-6
+        e = np.where(usable, np.vecdot(d, n) / length, 0.0)
         if self.fit_lens:
             across = ta[:, :2] ** 2 + tb[:, :2] ** 2
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
-        back = np.matvec(np.swapaxes(R12, 1, 2)[p.of], ta)
+        back = np.matvec(np.take(np.swapaxes(R12, 1, 2), p.of, axis=0), ta)
         local = so3.cross(self.b, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
-        J = np.einsum("ni,nik->nk", local, by_turn[p.of])
+        J = np.einsum("ni,nik->nk", local, np.take(by_turn, p.of, axis=0))
         if self.fit_lens:
             lens = np.einsum("ni,nik->nk", back, self.dray[1]) - np.einsum("ni,nik->nk", tb, self.dray[0])
             J = np.concatenate([J, lens], axis=1)
@@ -312,9 +313,8 @@ class _Fit:
         self, columns: FloatArray, Jt: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Jt' W columns by pair, and the move of its direction that fits the columns best, (P, 2, p) each."""
-        wJt = Jt * weight[:, None]
-        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], self.pairs.begin) + 1e-9 * np.eye(2)
-        tx = np.add.reduceat(wJt[:, :, None] * columns[:, None, :], self.pairs.begin)
+        both = _products(Jt * weight[:, None], np.concatenate([Jt, columns], axis=1), self.pairs.begin)
+        tt, tx = both[..., :2] + 1e-9 * np.eye(2), both[..., 2:]
         return tx, np.asarray(np.linalg.solve(tt, tx), np.float64)
 
     def _result(
@@ -418,7 +418,7 @@ class _Fit:
         squares: list[float] = []
         H: FloatArray = np.zeros((0, 0))
         for sign in (0.0, 1.0, -1.0):
-            self.pairs = replace(given, uv_1=given.uv_1 + sign * first, uv_2=given.uv_2 + sign * second)
+            self.pairs = given.moved(sign * first, sign * second)
             self._rays()
             lin = self._linearise(R, shift, bias)
             if lin is None:
@@ -468,3 +468,11 @@ class _Fit:
         """Derivatives by the shared unknowns with each pair's direction following along, shape (n, p)."""
         moved = self._directions(J, Jt, weight)[1]
         return np.asarray(J - np.einsum("ni,nik->nk", Jt, moved[self.pairs.of]))
+
+
+def _products(a: FloatArray, b: FloatArray, begin: IntArray) -> FloatArray:
+    """Sum of a' b over the rows of each pair, shape (P, i, j), of rows (n, i) and (n, j)."""
+    out = np.empty((len(begin), a.shape[1], b.shape[1]))
+    for pair, (low, high) in enumerate(pairwise([*begin.tolist(), len(a)])):
+        np.matmul(a[low:high].T, b[low:high], out=out[pair])
+    return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,8 @@ class Pairs:
         begin: First row of the pair, shape (P,).
         of: Pair of each row, shape (n,).
         ids: Feature of each row, shape (n,).
-        uv_1, uv_2: Pixels in both images, shape (n, 2).
+        uv: Pixels of all sightings; one is in up to six pairs; shape (s, 2).
+        at_1, at_2: Sighting of each row's feature in both images, shape (n,).
     """
 
     first: IntArray
@@ -29,8 +30,15 @@ class Pairs:
     begin: IntArray
     of: IntArray
     ids: IntArray
-    uv_1: FloatArray
-    uv_2: FloatArray
+    uv: FloatArray
+    at_1: IntArray
+    at_2: IntArray
+
+    def moved(self, first: FloatArray, second: FloatArray) -> Pairs:
+        """Return pairs of which the pixels in both images are moved by row, px, shape (n, 2) each."""
+        uv = np.concatenate([self.uv[self.at_1] + first, self.uv[self.at_2] + second])
+        at_1, at_2 = np.arange(len(uv)).reshape(2, -1)
+        return replace(self, uv=uv, at_1=at_1, at_2=at_2)
 
 
 def make_pairs(frames: Frames, lags_s: tuple[float, ...] = LAGS_S, every: int = 1) -> Pairs | None:
@@ -42,7 +50,8 @@ def make_pairs(frames: Frames, lags_s: tuple[float, ...] = LAGS_S, every: int = 
         every: Begin a pair in every n-th image only.
     """
     t = np.array([s for s, _ in frames])
-    first, second, count, ids, uv_1, uv_2 = [], [], [], [], [], []
+    begin = np.cumsum([0, *(len(f.ids) for _, f in frames)])
+    first, second, count, ids, at_1, at_2 = [], [], [], [], [], []
     for lag in lags_s:
         step = max(1, int(np.median(np.searchsorted(t, t[: len(t) // 2] + lag) - np.arange(len(t) // 2))))
         for i in range(0, len(t) - step, every):
@@ -57,17 +66,18 @@ def make_pairs(frames: Frames, lags_s: tuple[float, ...] = LAGS_S, every: int = 
             second.append(j)
             count.append(len(ka))
             ids.append(shared)
-            uv_1.append(a.uv_px[ka])
-            uv_2.append(b.uv_px[kb])
+            at_1.append(begin[i] + ka)
+            at_2.append(begin[j] + kb)
     if len(first) < 10:
         return None
     sizes = np.array(count)
+    used, at = np.unique(np.concatenate([*at_1, *at_2]), return_inverse=True)
     return Pairs(
         np.array(first),
         np.array(second),
         np.concatenate([[0], np.cumsum(sizes)[:-1]]),
         np.repeat(np.arange(len(sizes)), sizes),
         np.concatenate(ids),
-        np.concatenate(uv_1),
-        np.concatenate(uv_2),
+        np.concatenate([f.uv_px for _, f in frames])[used],
+        *at.reshape(2, -1),
     )

@@ -25,8 +25,8 @@ def pairs_of(lags=(2, 5, 10, 20, 40)):
     second = np.concatenate([np.arange(lag, N_IMAGES) for lag in lags])
     of = np.repeat(np.arange(len(first)), N_TRACKS)
     ids = np.tile(np.arange(N_TRACKS), len(first))
-    zero = np.zeros((len(of), 2))
-    return Pairs(first, second, np.arange(len(first)) * N_TRACKS, of, ids, zero, zero)
+    one = np.zeros((2, len(of)), dtype=int)
+    return Pairs(first, second, np.arange(len(first)) * N_TRACKS, of, ids, np.zeros((1, 2)), *one)
 
 
 def effects_of(pairs, seed=0):
