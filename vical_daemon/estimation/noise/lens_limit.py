@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from functools import lru_cache
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.model.camera_rays import patch_centres, unproject
+from vical_daemon.estimation.model.next_term import lens_slopes, rounded
 from vical_daemon.estimation.model.state import CameraState
 
 _UNSEEN = 1e-2  # of the weight of a patch: its error is a hundred times as large
-Numbers = tuple[float, ...]
 
 SYSTEMATIC_PX = 0.003
 """Constant error that corners of one patch of the image share, px; the curvature of edges alone makes up to
@@ -38,20 +35,10 @@ def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
         camera: Its lens counts.
         seen: Patches that are left out count next to nothing, shape (48,); None: all count.
     """
-    K = tuple(float(f"{x:.3g}") for x in camera.intrinsics.tolist())
-    D = tuple(round(x, 3) for x in camera.distortion.tolist())
-    by = _slopes(K, D, camera.distortion_model, camera.resolution)
+    by = lens_slopes(*rounded(camera))
     if seen is not None:
         by = np.where(seen[:, None, None], by, _UNSEEN * by)
     return np.asarray(np.linalg.qr(by.reshape(-1, by.shape[-1]))[1])
-
-
-@lru_cache(maxsize=64)
-def _slopes(K: Numbers, D: Numbers, model: str, resolution: tuple[int, int]) -> FloatArray:
-    intrinsics, distortion = np.array(K), np.array(D)
-    rays, ok = unproject(patch_centres(resolution), intrinsics, distortion, model)
-    by = project_jacobians(np.where(ok[:, None], rays, [0.0, 0.0, 1.0]), intrinsics, distortion, model)[2]
-    return np.where(ok[:, None, None], by, 0.0)
 
 
 _SIZES_PX = SYSTEMATIC_PX * 1.1 ** np.arange(80)  # to 5.6 px: lenses guessed from the resolution are nearer
