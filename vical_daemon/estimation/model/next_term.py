@@ -15,6 +15,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import patch_centres, unproject
 from vical_daemon.estimation.model.state import CameraState
 
+_UNSEEN_PX = 100.0  # patches of the image in which no points were seen count as known to so many pixels
 Numbers = tuple[float, ...]
 
 
@@ -22,17 +23,18 @@ def onto_model(camera: CameraState, seen: FloatArray) -> FloatArray:
     """What leads from the lens that is estimated to the one that is reported, shape (m, n).
 
     With N = sum J'J over the points, J their derivatives by the lens, a term k moves the coefficients of the
-    model by N_mm^-1 N_mk k. [weighted least squares] Before points are seen it is that over the whole image.
+    model by N_mm^-1 N_mk k. [weighted least squares]
 
     Args:
         camera: Its lens counts.
-        seen: N, over the variance of the points, shape (n, n), or zeros.
+        seen: N, over the variance of the points, shape (n, n); or zero: before points are seen, the whole
+            image counts alike.
     """
     n = 4 + len(camera.distortion)
     if not camera.term:
         return np.eye(n)
     by = lens_slopes(*rounded(camera)).reshape(-1, n)
-    N = seen + by.T @ by  # as if every patch had been seen to a pixel
+    N = seen + _UNSEEN_PX**-2.0 * by.T @ by
     return np.concatenate([np.eye(n - 1), np.linalg.solve(N[:-1, :-1], N[:-1, -1:])], axis=1)
 
 

@@ -29,9 +29,6 @@ _RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
 class LensAgreement:
     """Running agreement of one camera's lens.
 
-    Args:
-        model: radtan, plumb_bob or equidistant.
-
     Attributes:
         factors: Multiply the variances of fx fy cx cy and the distortion as they are reported, >= 1, shape
             (m,), or (1,) at first.
@@ -40,7 +37,6 @@ class LensAgreement:
         seen: Sum over the images of J'J, J the derivatives by the lens of points over their noise, (n, n).
     """
 
-    model: str
     factors: FloatArray = field(default_factory=lambda: np.ones(1))
     moved: FloatArray = field(default_factory=lambda: np.zeros(1))
     seen: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
@@ -65,7 +61,7 @@ class LensAgreement:
         """
         self.seen = self.seen + by_lens.T @ by_lens
         lens = np.concatenate([camera.intrinsics, camera.distortion])
-        by = with_next_power(by_lens, self.model)
+        by = with_next_power(by_lens, camera.distortion_model)
         if not self._stretches.learn(t_s, innovation, by_pose, by, lens):
             return
         weak = lens_sigmas(lens[0], len(lens) + 1)
@@ -79,7 +75,7 @@ class LensAgreement:
 
     def anew(self) -> LensAgreement:
         """Without what stretches have said."""
-        return LensAgreement(self.model, seen=self.seen)
+        return LensAgreement(seen=self.seen)
 
 
 def lens_sigmas(focal_px: float, n: int) -> FloatArray:
