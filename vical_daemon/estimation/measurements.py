@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, PLUMB_BOB, RADTAN
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -59,6 +59,7 @@ class CameraPrior:
             given, found from the data where it is estimated.
         intrinsics_sigma: How well fx fy cx cy are known where they are held, px; None: exactly.
         distortion_sigma: Likewise the coefficients.
+        term: The last coefficient is one more than the lens has that is reported, see `with_next_term`.
     """
 
     resolution: tuple[int, int]
@@ -71,6 +72,7 @@ class CameraPrior:
     readout_axis: str = ""
     intrinsics_sigma: tuple[float, float, float, float] | None = None
     distortion_sigma: tuple[float, ...] | None = None
+    term: bool = False
 
     def start_intrinsics(self) -> FloatArray:
         """Focal lengths and centre, px: as given, or of a lens of 60 degrees across; fx fy cx cy, (4,)."""
@@ -82,6 +84,23 @@ class CameraPrior:
         """The distortion as given, zeros where it is not, shape (d,)."""
         given = self.distortion or (0.0,) * len(COEFFICIENTS[self.distortion_model])
         return np.array(given, dtype=np.float64)
+
+    def with_next_term(self) -> CameraPrior:
+        """A radtan lens with the term of the radius that it would have next, k3; other lenses as they are.
+
+        No real lens is exactly radtan. With this term as an alternative model, sigmas include
+        what it would do.
+        """
+        if self.distortion_model != RADTAN:
+            return self
+        sigma = self.distortion_sigma
+        return replace(
+            self,
+            distortion_model=PLUMB_BOB,
+            distortion=(*self.coefficients().tolist(), 0.0),
+            distortion_sigma=None if sigma is None else (*sigma, 0.0),
+            term=True,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, F
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, calibration_difference
 from vical_daemon.estimation.smoother.normal import ImageNoise
-from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, with_next_term
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import (
     SLACK_S,
@@ -75,8 +75,8 @@ class TargetFreeCalibrator:
         for block in sorted({"target_scale", "target_shape"} & options.estimate):
             raise ValueError(f"without a target there is no {block} to estimate")
         self.options = options
-        self.camera, given = next(iter(cameras.items()))
-        prior = with_next_term(given)
+        ((self.camera, given),) = cameras.items()
+        prior = given.with_next_term()
         lens = FixedLens.considered(prior, options.fix)
         self.layout = make_layout(
             {self.camera: prior.distortion_model},
@@ -86,8 +86,7 @@ class TargetFreeCalibrator:
             core=CORE,
         )
         rolling = "readout" in options.estimate or prior.readout_s != 0.0
-        term = prior is not given
-        self.evaluator = TargetFreeStatus(options, self.layout, rolling=rolling, term=term)
+        self.evaluator = TargetFreeStatus(options, self.layout, rolling=rolling)
         self._first = FirstWindow(options, prior, self.layout, self.evaluator)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window

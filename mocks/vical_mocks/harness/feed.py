@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
-from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.estimation.wording import event_document
 from vical_mocks.points import SimulatedFrame, SimulatedRun
 from vical_mocks.rotations import exp_so3, log_so3
@@ -226,7 +225,7 @@ class CalibratorSubject:
             camera.intrinsics,
             camera.distortion,
         )
-        covariance = self._published_covariance(camera)
+        covariance = np.asarray(camera.calibration_covariance)
         extra = {
             "nis_per_dof": estimate.nis_per_dof,
             "rejected": estimate.rejected_fraction,
@@ -236,44 +235,6 @@ class CalibratorSubject:
             gravity = np.asarray(estimate.gravity_world_mps2) - run.rig.gravity_world_mps2
             extra["gravity_error"] = float(np.linalg.norm(gravity))
         return Snapshot(t_s, status, error, covariance, extra)
-
-    def _published_covariance(self, camera: CameraEstimate) -> FloatArray:
-        """What the estimate claims; the correlations between its blocks come from the filter."""
-        sigmas = [camera.timeshift_sigma_s, *camera.intrinsics_sigma, *camera.distortion_sigma]
-        claimed = np.diag(np.square([0.0] * 6 + sigmas))
-        claimed[:6, :6] = np.asarray(camera.T_imu_cam.covariance)
-        inner = getattr(self.calibrator, "filter", None)
-        if inner is None:
-            return claimed
-        rows, places = self._rows(inner.layout.cameras[CAMERA])
-        joint = self.calibrator.evaluator.weighed(inner).covariance(rows)
-        spread = np.sqrt(np.diag(joint))
-        spread[spread == 0.0] = 1.0  # a fixed lens that is surely right
-        correlation = joint / np.outer(spread, spread)
-        sigma = np.sqrt(np.diag(claimed))[places]
-        full = np.zeros_like(claimed)
-        full[np.ix_(places, places)] = correlation * np.outer(sigma, sigma)
-        full[:6, :6] = claimed[:6, :6]
-        return full
-
-    @staticmethod
-    def _rows(where: Any) -> tuple[list[int], list[int]]:
-        """Rows of the calibration block in the filter, and their places in the error vector."""
-        shift = None if where.timeshift is None else slice(where.timeshift, where.timeshift + 1)
-        blocks = (
-            (where.position, 0),
-            (where.rotation, 3),
-            (shift, 6),
-            (where.intrinsics, 7),
-            (where.distortion, 11),
-        )
-        rows: list[int] = []
-        places: list[int] = []
-        for block, first in blocks:
-            if block is not None:
-                rows += range(block.start, block.stop)
-                places += range(first, first + block.stop - block.start)
-        return rows, places
 
 
 def _make_calibrator(options: CalibrationOptions, prior: CameraPrior, points_m: FloatArray | None) -> Any:

@@ -88,7 +88,7 @@ def some_filter(imu=1.0, target=0.0, lag=0.0, size=0.0, factor=1.0, scale=1.0):
     consistency.factor, consistency.scale = factor, scale
     f = CalibrationFilter(
         retract(start, layout, x), layout, np.linalg.cholesky(P), ImuNoise(), {NAME: CornerNoise(0.5)},
-        np.zeros(n), {NAME: consistency}, {NAME: LensAgreement("radtan")},
+        np.zeros(n), {NAME: consistency}, {NAME: LensAgreement()},
     )  # fmt: skip
     return f, x, P, dense
 

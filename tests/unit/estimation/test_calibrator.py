@@ -12,7 +12,6 @@ from vical_mocks.rig import Bump, reference_rig
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 
@@ -110,20 +109,23 @@ def test_nothing_is_known_about_mounting_and_delay_and_all_is_found(run, done):
     assert len(done.trace("cam0")) >= 8
 
 
-def test_a_lens_that_needs_one_term_more_is_told_once():
-    run = simulate(5, 8.0)
-    c = calibrate(run, CalibrationOptions())
-    f, frame = c.filter, run.frames[-1]
-    zeros, good = np.zeros_like(frame.uv_px), np.ones(len(frame.ids), bool)
-    report = FrameReport(0, "cam0", frame.ids, frame.uv_px, zeros, good, True, 1.0, 1, 0.5)
-    c.estimate()
-    c.evaluator.saw_frame(report, f)
-    assert c.estimate().events == []
-    f.agreement["cam0"].moved[4] = 0.01
-    for _ in range(2):
-        c.evaluator.saw_frame(report, f)
-    (event,) = c.estimate().events
-    assert event.kind is EventKind.LENS_TERM_MISSING and event.camera == "cam0"
+def test_a_lens_that_needs_one_term_more_is_told_once_and_is_in_the_sigmas():
+    plain = reference_rig(5)
+    run = simulate(5, 8.0, rig=replace(plain, lens=replace(plain.lens, sixth_power=0.15)))
+    known = prior(run)["cam0"]
+    start = replace(known, distortion_model="radtan", distortion=known.distortion[:4])
+    events = []
+    c = calibrate(
+        run, CalibrationOptions(), {"cam0": start}, each=lambda c: events.extend(c.estimate().events)
+    )
+    (event,) = [e for e in events + c.estimate().events if e.kind is EventKind.LENS_TERM_MISSING]
+    assert event.camera == "cam0"
+    camera = c.estimate().cameras["cam0"]
+    assert camera.distortion_model == "radtan"
+    assert [len(camera.distortion), len(camera.distortion_sigma)] == [4, 4]
+    assert np.shape(camera.calibration_covariance) == (15, 15)
+    x, sigma = errors(c.estimate(), run)
+    assert np.abs(x / sigma).max() < 3.5
 
 
 def test_runs_are_bit_identical(run, done):

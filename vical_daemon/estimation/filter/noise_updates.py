@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from vical_daemon.estimation.filter.image_update import ImageFit, whitened
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import FloatArray
@@ -53,6 +51,5 @@ def _ask_lens(
     shape, mean = f.layout.target_shape, f.mean
     if shape is not None and "target_shape" not in f.off:
         innovation = innovation + ways @ (lin.by_error[:, shape] @ mean.target_shape)
-    camera = mean.cameras[name]
-    values = np.concatenate([camera.intrinsics, camera.distortion])
-    agreement.learn(f.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)
+    by_pose = ways @ lin.by_error[:, :6]
+    agreement.learn(f.state.t_s, innovation, by_pose, ways @ by_lens, mean.cameras[name])

@@ -6,6 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.next_term import onto_model, reported_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
@@ -20,7 +21,8 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     much as stretches of the data disagree about it (see `lens_agreement`), and as detectors allow
     (`lens_limit`).
     """
-    camera, where, held = f.state.cameras[name], f.layout.cameras[name], f.layout.held.get(name)
+    where, held = f.layout.cameras[name], f.layout.held.get(name)
+    camera = reported_camera(f.state.cameras[name], _onto(f, name))
     lens = np.concatenate([camera.intrinsics, camera.distortion]) if held is None else held.values
     spread = float(np.sqrt(f.consistency[name].factor))
     lens_sigma = _lens_sigmas(f, name, spread)
@@ -37,6 +39,12 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     )
 
 
+def _onto(f: CalibrationFilter, name: str) -> FloatArray:
+    """See `onto_model`."""
+    agreement = f.agreement.get(name)
+    return onto_model(f.state.cameras[name], np.zeros((1, 1)) if agreement is None else agreement.seen)
+
+
 def _calibration_covariance(
     f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray
 ) -> FloatArray:
@@ -46,7 +54,7 @@ def _calibration_covariance(
     model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose
     would be for another lens follows from its correlation with the pose.
     """
-    out = spread**2 * joint_covariance(f.S, f.layout.cameras[name], len(lens_sigma))
+    out = spread**2 * joint_covariance(f.S, f.layout.cameras[name], _onto(f, name))
     if f.layout.lens_free(name):
         lens = slice(7, None)
         out[lens, lens] += np.diag(np.maximum(lens_sigma**2 - np.diag(out)[lens], 0.0))
@@ -61,14 +69,13 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
     camera, where = f.state.cameras[name], f.layout.cameras[name]
     if where.intrinsics is None or where.distortion is None:
         return np.zeros(4 + len(camera.distortion))
-    raw = f.sigmas()
+    onto = _onto(f, name)
+    raw = np.linalg.norm(onto @ f.S[f.layout.lens(name)], axis=1)
     if name in f.layout.held:
-        return f.layout.held[name].reported(spread * raw[f.layout.lens(name)])
-    agreement = f.agreement[name]
-    filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
-        [raw[where.intrinsics], raw[where.distortion]]
-    )
-    return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + lens_limit(camera) ** 2))
+        return f.layout.held[name].reported(spread * raw)
+    agreement, limit = f.agreement[name], lens_limit(reported_camera(camera, onto))
+    filtered = np.maximum(np.sqrt(agreement.factors), spread) * raw
+    return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + limit**2))
 
 
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:

@@ -24,6 +24,7 @@ def starting_camera(prior: CameraPrior) -> CameraState:
         prior.resolution,
         prior.readout_s,
         readout_axis=prior.readout_axis,
+        term=prior.term,
     )
 
 

@@ -75,7 +75,7 @@ def initial_filter(
     if unobservable is not None:
         for where in layout.cameras.values():
             unobservable.hold(root, where)
-    agreement = {name: LensAgreement(state.cameras[name].distortion_model) for name in layout.cameras}
+    agreement = {name: LensAgreement() for name in layout.cameras}
     shared = {name: SharedErrors() for name in layout.cameras}
     return CalibrationFilter(
         state,

@@ -36,6 +36,8 @@ class RigModel:
     ) -> None:
         self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
         self.silent: frozenset[str] = frozenset()
+        if "intrinsics" not in options.fix:
+            self.priors = {name: prior.with_next_term() for name, prior in cameras.items()}
         self._stated = target_points_m
         self._options = options
         self.turns = HalfTurns(target_points_m, alike=options.target_alike)

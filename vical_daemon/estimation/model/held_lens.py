@@ -79,8 +79,8 @@ class FixedLens:
         return replace(self, off_sigma=np.maximum(sigma, _WIDER * self.sigma), off=0.5)
 
     def reported(self, sigma: FloatArray) -> FloatArray:
-        """Standard deviations as they are reported: zeros where only rounding is left; shape (n,)."""
-        return np.where(sigma > _ROUNDING * self.off_sigma, sigma, 0.0)
+        """Standard deviations of what is reported: zeros where only rounding is left; shape (at most n,)."""
+        return np.where(sigma > _ROUNDING * self.off_sigma[: len(sigma)], sigma, 0.0)
 
     def displacement_px(
         self, off: FloatArray, covariance: FloatArray, model: str, resolution: tuple[int, int]

@@ -207,7 +207,7 @@ def moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> Ca
     if where.readout is not None:
         readout += float(dx[where.readout])
     model, axis = camera.distortion_model, camera.readout_axis
-    return CameraState(R, p, shift, K, D, model, camera.resolution, readout, skew, axis)
+    return CameraState(R, p, shift, K, D, model, camera.resolution, readout, skew, axis, camera.term)
 
 
 def orthonormal(R: FloatArray) -> FloatArray:

@@ -14,20 +14,21 @@ from vical_daemon.estimation.model.state import CameraSlices, CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 
 
-def joint_covariance(S: FloatArray, where: CameraSlices, length: int) -> FloatArray:
+def joint_covariance(S: FloatArray, where: CameraSlices, onto: FloatArray) -> FloatArray:
     """Covariance of [lever arm, rotation, time shift, lens], zeros where not estimated, shape (7 + n, 7 + n).
 
     Args:
         S: Square root of the covariance of the errors.
         where: Of the camera.
-        length: n, of its lens.
+        onto: From its lens to what is reported of it, see `next_term.onto_model`, shape (n, k).
     """
     shift = None if where.timeshift is None else slice(where.timeshift, where.timeshift + 1)
     places = (where.position, where.rotation, shift, where.intrinsics, where.distortion)
-    rows = np.zeros((7 + length, S.shape[1]))
-    for place, (begin, end) in zip(places, pairwise((0, 3, 6, 7, 11, 7 + length)), strict=True):
+    rows = np.zeros((7 + onto.shape[1], S.shape[1]))
+    for place, (begin, end) in zip(places, pairwise((0, 3, 6, 7, 11, len(rows))), strict=True):
         if place is not None:
-            rows[begin:end] = S[place][: end - begin]
+            rows[begin:end] = S[place]
+    rows = np.concatenate([rows[:7], onto @ rows[7:]])
     return np.asarray(rows @ rows.T)
 
 

@@ -210,7 +210,7 @@ def _camera_slices(
 class CameraState:
     """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s.
 
-    `readout_axis`: see `CameraPrior`; it is no number, and stays.
+    `readout_axis` and `term`: see `CameraPrior`; they are no numbers, and stay.
     """
 
     R_imu_cam: FloatArray
@@ -223,6 +223,7 @@ class CameraState:
     readout_s: float = 0.0
     skew: float = 0.0
     readout_axis: str = ""
+    term: bool = False
 
 
 @dataclass(slots=True)

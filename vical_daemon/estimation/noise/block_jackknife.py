@@ -46,7 +46,7 @@ class JackknifeResult(NamedTuple):
     Attributes:
         values: Of the unknowns, shape (m,).
         covariance: If errors were independent, shape (m, m).
-        factors: By which its diagonal is too small, >= 1, shape (m,).
+        factors: By which the variances of what is compared are too small, >= 1, shape (m,).
     """
 
     values: FloatArray
@@ -105,12 +105,13 @@ class BlockJackknife:
         if len(self._done) > _MOST:
             self._done[:2] = [self._done[0].plus(self._done[1])]
 
-    def compared(self, sigmas: FloatArray) -> JackknifeResult:
+    def compared(self, sigmas: FloatArray, onto: FloatArray) -> JackknifeResult:
         """Leave out each run of stretches in turn.
 
         Args:
             sigmas: Of a prior about zero that hardly matters; of the first so many unknowns, shape (k,), the
                 others are held at zero.
+            onto: What is compared: these combinations of the unknowns, shape (m, k).
         """
         k = len(sigmas)
         A = np.array([s.information[:k, :k] for s in self._done])
@@ -128,11 +129,12 @@ class BlockJackknife:
         Q = np.linalg.inv(left[np.arange(len(runs)), np.arange(len(runs))])
         without = np.matvec(Q, b.sum(axis=0) - out @ b)
         # covariance of the changes were errors independent: stretches do not tell equally much
-        C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
-        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * np.diag(P))
-        ratio = ((without - values) ** 2 / usual).mean(axis=0)
+        Q, spread = onto @ Q, np.vecdot(onto @ P, onto)
+        C = np.einsum("rpi,rsij,spj->rsp", Q, left, Q, optimize=True) - spread
+        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * spread)
+        ratio = (((without - values) @ onto.T) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-        limit = chdtri(dof, chance(PERHAPS_SIGMAS) / k) / dof
+        limit = chdtri(dof, chance(PERHAPS_SIGMAS) / len(onto)) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
         return JackknifeResult(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -12,8 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
+from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.next_term import onto_model
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, STRETCH_S
 
@@ -27,26 +29,26 @@ _RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
 class LensAgreement:
     """Running agreement of one camera's lens.
 
-    Args:
-        model: radtan, plumb_bob or equidistant.
-
     Attributes:
-        factors: Multiply the variances of fx fy cx cy and the distortion coefficients, >= 1, shape (n,).
+        factors: Multiply the variances of fx fy cx cy and the distortion as they are reported, >= 1, shape
+            (m,), or (1,) at first.
         moved: How far those would move with one more power of the radius, where that is there beyond doubt;
-            else zeros; px and -, shape (n,).
+            else zeros; px and -, likewise.
+        seen: Sum over the images of J'J, J the derivatives by the lens of points over their noise, (n, n).
     """
 
-    model: str
-    factors: FloatArray = field(init=False)
-    moved: FloatArray = field(init=False)
+    factors: FloatArray = field(default_factory=lambda: np.ones(1))
+    moved: FloatArray = field(default_factory=lambda: np.zeros(1))
+    seen: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     _stretches: BlockJackknife = field(default_factory=lambda: BlockJackknife(STRETCH_S))
 
-    def __post_init__(self) -> None:
-        n = 4 + len(COEFFICIENTS[self.model])
-        self.factors, self.moved = np.ones(n), np.zeros(n)
-
     def learn(
-        self, t_s: float, innovation: FloatArray, by_pose: FloatArray, by_lens: FloatArray, lens: FloatArray
+        self,
+        t_s: float,
+        innovation: FloatArray,
+        by_pose: FloatArray,
+        by_lens: FloatArray,
+        camera: CameraState,
     ) -> None:
         """Take in one image before it is used.
 
@@ -55,19 +57,25 @@ class LensAgreement:
             innovation: Measured minus predicted, over the corner noise, shape (2k,).
             by_pose: Derivatives of the whitened pixels by attitude and position, shape (2k, 6).
             by_lens: By fx fy cx cy and the distortion, shape (2k, n).
-            lens: Present values, shape (n,).
+            camera: Its lens at present.
         """
-        by = with_next_power(by_lens, self.model)
+        self.seen = self.seen + by_lens.T @ by_lens
+        lens = np.concatenate([camera.intrinsics, camera.distortion])
+        by = with_next_power(by_lens, camera.distortion_model)
         if not self._stretches.learn(t_s, innovation, by_pose, by, lens):
             return
         weak = lens_sigmas(lens[0], len(lens) + 1)
-        n = len(lens)
-        self.factors = self._stretches.compared(weak[:n]).factors
-        free = self._stretches.compared(weak)
+        n, onto = len(lens), onto_model(camera, self.seen)
+        self.factors = self._stretches.compared(weak[:n], onto).factors
+        free = self._stretches.compared(weak, np.eye(n + 1))
         power, variance = free.values[n], free.covariance[n, n]
         doubt = LIKELY_SIGMAS**2 * free.factors[n] * variance
         there = power if power**2 > doubt else 0.0
-        self.moved = free.covariance[:n, n] * (there / variance)
+        self.moved = onto @ free.covariance[:n, n] * (there / variance)
+
+    def anew(self) -> LensAgreement:
+        """Without what stretches have said."""
+        return LensAgreement(seen=self.seen)
 
 
 def lens_sigmas(focal_px: float, n: int) -> FloatArray:

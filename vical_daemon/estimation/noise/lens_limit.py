@@ -7,13 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.model.camera_rays import patch_centres, unproject
+from vical_daemon.estimation.model.next_term import Numbers, lens_slopes, rounded
 from vical_daemon.estimation.model.state import CameraState
 
 _UNSEEN = 1e-2  # of the weight of a patch: its error is a hundred times as large
-Numbers = tuple[float, ...]
 
 SYSTEMATIC_PX = 0.003
 """Constant error that corners of one patch of the image share, px; the curvature of edges alone makes up to
@@ -28,7 +26,7 @@ def limit(camera: CameraState) -> FloatArray:
 
     A number that no patch shows gets 0: a lens that is far off may have rays for hardly any of them.
     """
-    return np.asarray(SYSTEMATIC_PX * _by_one_px(*_rounded(camera)))
+    return np.asarray(SYSTEMATIC_PX * _by_one_px(*rounded(camera)))
 
 
 def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
@@ -38,30 +36,16 @@ def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
         camera: Its lens counts.
         seen: Patches that are left out count next to nothing, shape (48,); None: all count.
     """
-    by = _slopes(*_rounded(camera))
+    by = lens_slopes(*rounded(camera))
     if seen is not None:
         by = np.where(seen[:, None, None], by, _UNSEEN * by)
     return np.asarray(np.linalg.qr(by.reshape(-1, by.shape[-1]))[1])
 
 
-def _rounded(camera: CameraState) -> tuple[Numbers, Numbers, str, tuple[int, int]]:
-    K = tuple(float(f"{x:.3g}") for x in camera.intrinsics.tolist())
-    D = tuple(round(x, 3) for x in camera.distortion.tolist())
-    return K, D, camera.distortion_model, camera.resolution
-
-
 @lru_cache(maxsize=64)
 def _by_one_px(K: Numbers, D: Numbers, model: str, resolution: tuple[int, int]) -> FloatArray:
-    by = _slopes(K, D, model, resolution)
+    by = lens_slopes(K, D, model, resolution)
     return np.asarray(np.linalg.norm(np.linalg.pinv(by.reshape(-1, by.shape[-1])), axis=1))
-
-
-@lru_cache(maxsize=64)
-def _slopes(K: Numbers, D: Numbers, model: str, resolution: tuple[int, int]) -> FloatArray:
-    intrinsics, distortion = np.array(K), np.array(D)
-    rays, ok = unproject(patch_centres(resolution), intrinsics, distortion, model)
-    by = project_jacobians(np.where(ok[:, None], rays, [0.0, 0.0, 1.0]), intrinsics, distortion, model)[2]
-    return np.where(ok[:, None, None], by, 0.0)
 
 
 _SIZES_PX = SYSTEMATIC_PX * 1.1 ** np.arange(80)  # to 5.6 px: lenses guessed from the resolution are nearer

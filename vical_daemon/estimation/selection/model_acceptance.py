@@ -14,9 +14,8 @@ from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIG
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import MEMORY, TELLING
-from vical_daemon.estimation.selection.model_mixture import Block, lens_block, not_zero
+from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens_block, not_zero, term_block
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
 from vical_daemon.estimation.significance import EVERY_S
 
@@ -92,18 +91,18 @@ class ModelAcceptance:
         known = [
             name
             for name in every
-            if name not in f.off and not_zero(shares, name) > SURE and images >= _needed(name, every, shares)
+            if name not in f.off and not_zero(shares, name) > SURE and images >= _needed(f, name, shares)
         ]
         return {name: _off(f, name) for name in known}
 
 
-def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], float]) -> int:
+def _needed(f: CalibrationFilter, name: str, shares: Weights) -> int:
     """Images before a block is announced.
 
     Images that do not fit can look like a lag; their misfit must be measured first. A wrong fixed lens can
     look like any of the blocks; the first images may show either.
     """
-    held = [other for other, block in every.items() if block.held]
+    held = [lens_block(camera) for camera in f.layout.held]
     if name in held:
         return 0
     if name == LAG or any(not_zero(shares, other) > OFF for other in held):
@@ -115,14 +114,16 @@ def _off(f: CalibrationFilter, name: str) -> Event:
     """Let a block stand by itself; return the announcement."""
     block = blocks(f)[name]
     f.off.add(name)
+    camera = next((c for c in f.layout.cameras if name in (lens_block(c), term_block(c))), "")
+    if name == term_block(camera):
+        return Event(EventKind.LENS_TERM_MISSING, camera)
     if block.held:
-        camera = next(c for c in f.layout.held if lens_block(c) == name)
         rows = f.S[block.where]
         covariance = factor(f) * (rows @ rows.T)
         return lens_off(camera, f.layout.held[camera], block, covariance, f.state.cameras[camera])
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as in its file
-        f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
+        f.agreement = {camera: agreement.anew() for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]
     return known_off(name, block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

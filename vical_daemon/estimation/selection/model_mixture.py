@@ -174,6 +174,11 @@ def lens_block(camera: str) -> str:
     return f"lens of {camera}"
 
 
+def term_block(camera: str) -> str:
+    """Name of the block of the term that a free lens has beyond its model."""
+    return f"lens term of {camera}"
+
+
 def log_bayes_factor(
     values: FloatArray, covariance: FloatArray, factor: float, share: FloatArray | None = None
 ) -> float:

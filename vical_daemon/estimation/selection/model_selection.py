@@ -10,11 +10,18 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.imu_scale import ENTRIES, numbers_of
-from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, OFF, SIZE_SIGMA
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, FILTER_START, LAG_SIGMA_S, OFF, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.selection import model_mixture
-from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens_block, mixture, not_zero
+from vical_daemon.estimation.selection.model_mixture import (
+    Block,
+    Weights,
+    lens_block,
+    mixture,
+    not_zero,
+    term_block,
+)
 
 IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
 IN_DOUBT = {
@@ -41,10 +48,20 @@ def imu_and_lenses(
     return found
 
 
+def lens_term(layout: Layout, name: str, camera: CameraState, *, held: bool = False) -> Block:
+    """The term that a free lens has beyond its model; `held`: what is reported is the lens without it."""
+    end = layout.lens(name).stop
+    sigma = np.array([FILTER_START.distortion])
+    return Block(slice(end - 1, end), camera.distortion[-1:], sigma, np.zeros(1), held=held)
+
+
 def blocks(f: CalibrationFilter) -> dict[str, Block]:
     """What a filter estimates apart from the calibration, by its name in `CalibrationOptions.estimate`."""
     layout, state = f.layout, f.state
     found = imu_and_lenses(layout, numbers_of(state), state.cameras)
+    for name, camera in state.cameras.items():
+        if camera.term:
+            found[term_block(name)] = lens_term(layout, name, camera)
     if layout.target_scale is not None:
         where = slice(layout.target_scale, layout.target_scale + 1)
         found[SIZE] = Block.of(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)

@@ -11,13 +11,19 @@ from vical_daemon.estimation.model.priors import (
     KNOWN_OFF_SIGMA,
     OFF,
     SURE,
-    WINDOW_START,
 )
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.selection.model_acceptance import known_off, lens_off
-from vical_daemon.estimation.selection.model_mixture import Block, Weights, hypotheses, lens_block, not_zero
+from vical_daemon.estimation.selection.model_mixture import (
+    Block,
+    Weights,
+    hypotheses,
+    lens_block,
+    not_zero,
+    term_block,
+)
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.clock_changes import (
     Clock,
@@ -29,8 +35,6 @@ from vical_daemon.estimation.smoother.clock_changes import (
 )
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import ReportedModels
-
-_TERM = "lens_term"
 
 _WINDOWS_SHOW = 2  # beginning with that in which something changed, until what it was is clear
 
@@ -47,7 +51,6 @@ class AlternativeModels:
         layout: Where the errors live.
         asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
         rolling: The shutter is configured as a rolling one, or its readout is asked for.
-        term: Its last coefficient is one more than its model has.
 
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
@@ -64,10 +67,9 @@ class AlternativeModels:
         *,
         asked: frozenset[str],
         rolling: bool,
-        term: bool = False,
     ) -> None:
         (self._camera,) = layout.cameras
-        self._term, self.lens = term, layout.held.get(self._camera)
+        self.lens = layout.held.get(self._camera)
         self._off = asked & {model_selection.IMU, model_selection.LAG}
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
@@ -106,7 +108,7 @@ class AlternativeModels:
         covariance = factor * carry.covariance()[block.where, block.where]
         if self.lens is not None and block.held:
             return lens_off(self._camera, self.lens, block, covariance, carry.camera)
-        if name == _TERM:
+        if name == term_block(self._camera):
             return Event(EventKind.LENS_TERM_MISSING, self._camera)
         return known_off(name, block.values, np.sqrt(np.diag(covariance)))
 
@@ -208,7 +210,6 @@ class AlternativeModels:
             weights,
             gyro_frame=not self.imu_asked,
             rolling=self.rolling,
-            term=self._term,
         )
 
     def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
@@ -222,9 +223,8 @@ class AlternativeModels:
 
     def _blocks(self, carry: MarginalPrior) -> dict[str, Block]:
         """What is estimated apart from the calibration, by its name in `CalibrationOptions.estimate`."""
-        (name,), where = carry.layout.cameras, carry.layout.camera.distortion
-        found = model_selection.imu_and_lenses(carry.layout, carry.imu, {name: carry.camera})
-        if self._term and self.lens is None and where is not None:
-            last, now = slice(where.stop - 1, where.stop), carry.camera.distortion[-1:]
-            found[_TERM] = Block(last, now, np.array([WINDOW_START.distortion]), np.zeros(1), held=True)
+        found = model_selection.imu_and_lenses(carry.layout, carry.imu, {self._camera: carry.camera})
+        if carry.camera.term and self.lens is None:
+            term = model_selection.lens_term(carry.layout, self._camera, carry.camera, held=True)
+            found[term_block(self._camera)] = term
         return found

@@ -10,10 +10,10 @@ import numpy as np
 
 from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
-from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model import imu_scale
 from vical_daemon.estimation.model.imu_scale import matrices as matrices_of
+from vical_daemon.estimation.model.next_term import reported_camera
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
 from vical_daemon.estimation.model.state import CameraState
@@ -33,7 +33,6 @@ class ReportedModels(NamedTuple):
         weights: Probability of each hypothesis about these.
         gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
         rolling: The shutter is known to be a rolling one: its readout is reported.
-        term: The last coefficient of the lens is one more than its model has, and is not reported.
     """
 
     factor: float
@@ -42,7 +41,6 @@ class ReportedModels(NamedTuple):
     weights: Weights
     gyro_frame: bool = False
     rolling: bool = True
-    term: bool = False
 
 
 def camera_estimate(
@@ -63,16 +61,23 @@ def camera_estimate(
     """
     camera, S = _averaged(carry, models)
     (name,), where = carry.layout.cameras, carry.layout.camera
-    lens, fixed = np.concatenate([camera.intrinsics, camera.distortion]), carry.layout.held.get(name)
-    joint = models.factor * joint_covariance(S, where, len(lens))
+    fixed = carry.layout.held.get(name)
+    n = 4 + len(camera.distortion)
+    onto = np.eye(n - camera.term, n)
+    camera = reported_camera(camera, onto)
+    lens, joint = (
+        np.concatenate([camera.intrinsics, camera.distortion]),
+        models.factor * joint_covariance(S, where, onto),
+    )
     if held is not None:
         joint[:3, :3] += held_covariance(np.outer(held, held))
     lens_sigma = np.sqrt(np.diag(joint)[7:])
     if fixed is not None:
-        lens, lens_sigma = fixed.values, fixed.reported(lens_sigma)
-    if models.term:
-        lens, lens_sigma, joint = lens[:-1], lens_sigma[:-1], joint[:-1, :-1]
-        camera = replace(camera, distortion=lens[4:], distortion_model=RADTAN)
+        n = len(lens)
+        lens, lens_sigma = (
+            fixed.values[:n],
+            fixed.reported(np.pad(lens_sigma, (0, len(fixed.values) - n)))[:n],
+        )
     return camera_snapshot(
         camera,
         joint=joint,

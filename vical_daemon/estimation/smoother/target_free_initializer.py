@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
 from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts
@@ -244,19 +243,6 @@ class TargetFreeInitializer:
             tilt = np.deg2rad(20.0)
             seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
         return seeds, ""
-
-
-def with_next_term(prior: CameraPrior) -> CameraPrior:
-    """A radtan lens with the term of the radius that it would have next, k3; other lenses as they are."""
-    if prior.distortion_model != RADTAN:
-        return prior
-    sigma = prior.distortion_sigma
-    return replace(
-        prior,
-        distortion_model=PLUMB_BOB,
-        distortion=(*prior.coefficients().tolist(), 0.0),
-        distortion_sigma=None if sigma is None else (*sigma, 0.0),
-    )
 
 
 def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:

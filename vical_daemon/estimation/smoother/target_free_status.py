@@ -42,7 +42,6 @@ class TargetFreeStatus(Evaluator):
         options: Switches and targets.
         layout: Where the errors live.
         rolling: The camera is configured with a rolling shutter, or its readout is asked for.
-        term: Its last coefficient is one more than its model has.
     """
 
     def __init__(
@@ -51,7 +50,6 @@ class TargetFreeStatus(Evaluator):
         layout: Layout,
         *,
         rolling: bool = False,
-        term: bool = False,
     ) -> None:
         super().__init__(
             options, "no features have been followed yet: is the picture dark or blurred?", WINDOWS
@@ -68,7 +66,7 @@ class TargetFreeStatus(Evaluator):
         self._trace[self.camera] = Trace()
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling, term=term)
+        self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling)
         self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 

@@ -11,7 +11,6 @@ from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
@@ -147,9 +146,6 @@ class StatusEvaluator(Evaluator):
         if shared.wander_px:
             event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
             self.announce(event, once=f"wander {report.camera}")
-        lens = f.agreement[report.camera]
-        if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
-            self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())

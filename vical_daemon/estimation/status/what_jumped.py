@@ -26,7 +26,6 @@ from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import SKEW_SIGMA
 from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, VELOCITY, Layout, State
-from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.status.recent_past import Taken
 
 _SHIFT_S = 5e-3
@@ -259,7 +258,7 @@ def _follow_after(
     f.inflate_covariance(columns)
     f.jumped = jumped = JumpSizes.of(columns)
     if Part.LENS in parts:  # what stretches of the data said about it no longer holds
-        f.agreement[camera] = LensAgreement(f.agreement[camera].model)
+        f.agreement[camera] = f.agreement[camera].anew()
         held = dict(f.layout.held)
         if camera in held:
             rows = f.S[f.layout.lens(camera)]

@@ -4,15 +4,21 @@ import cv2
 import numpy as np
 import pytest
 
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 
 LENS = np.array([500.0, 500.0, 320.0, 240.0, -0.2, 0.05, 0.0, 0.0])
 SIZE = np.array([1.0, 1.0, 1.0, 1.0, 1e-2, 2e-2, 1e-3, 1e-3])  # what one image of unit noise says, roughly
 
 
+def camera_of(lens, **changes):
+    """A camera of this lens."""
+    return CameraState(np.eye(3), np.zeros(3), 0.0, lens[:4], lens[4:], "radtan", (640, 480), **changes)
+
+
 def run(rng, scatter, stretches=12, images=lambda stretch: 6):
     """Linear images whose lens changes from stretch to stretch; returns factors and error of the mean."""
-    agreement = LensAgreement("radtan")
+    agreement = LensAgreement()
     information, weighted = np.zeros((8, 8)), np.zeros(8)
     for stretch in range(stretches):
         lens = LENS + scatter * SIZE * rng.standard_normal(8)
@@ -21,12 +27,12 @@ def run(rng, scatter, stretches=12, images=lambda stretch: 6):
             by_pose = rng.standard_normal((60, 6))
             pose = 50.0 * rng.standard_normal(6)  # an innovation also holds an error of the pose
             innovation = by_lens @ (lens - LENS) + by_pose @ pose + rng.standard_normal(60)
-            agreement.learn(5.0 * stretch + 0.3 * k, innovation, by_pose, by_lens, LENS)
+            agreement.learn(5.0 * stretch + 0.3 * k, innovation, by_pose, by_lens, camera_of(LENS))
             Q = np.linalg.qr(by_pose)[0]
             J = by_lens - Q @ (Q.T @ by_lens)
             information += J.T @ J
             weighted += J.T @ innovation
-    agreement.learn(5.0 * stretches, innovation, by_pose, by_lens, LENS)
+    agreement.learn(5.0 * stretches, innovation, by_pose, by_lens, camera_of(LENS))
     covariance = np.linalg.inv(information)
     return agreement.factors, covariance @ weighted / np.sqrt(np.diag(covariance))
 
@@ -63,11 +69,11 @@ def test_two_stretches_are_not_enough_to_say_anything():
 
 
 def test_memory_is_bounded():
-    agreement = LensAgreement("radtan")
+    agreement = LensAgreement()
     rng = np.random.default_rng(4)
     for k in range(300):
         J, P = rng.standard_normal((20, 8)), rng.standard_normal((20, 6))
-        agreement.learn(5.0 * k, rng.standard_normal(20), P, J, LENS)
+        agreement.learn(5.0 * k, rng.standard_normal(20), P, J, camera_of(LENS))
     assert len(agreement._stretches._done) <= 40
     assert np.isfinite(agreement.factors).all()
 
@@ -91,10 +97,10 @@ def images_of(rng, lens, k3, reach, count=60):
 def test_a_lens_with_one_more_coefficient_is_known_as_well_as_that_leaves_it(reach):
     rng = np.random.default_rng(6)
     lens = np.array([460.0, 458.0, 367.0, 248.0, -0.30, 0.12, 4e-4, -2e-4])
-    agreement = LensAgreement("radtan")
+    agreement = LensAgreement()
     information, weighted = np.zeros((8, 8)), np.zeros(8)
     for k, (innovation, by_pose, by_lens) in enumerate(images_of(rng, lens, -0.05, reach)):
-        agreement.learn(0.6 * k, innovation, by_pose, by_lens, lens)
+        agreement.learn(0.6 * k, innovation, by_pose, by_lens, camera_of(lens))
         Q = np.linalg.qr(by_pose)[0]
         J = by_lens - Q @ (Q.T @ by_lens)
         information += J.T @ J
@@ -113,28 +119,30 @@ def test_a_lens_of_the_model_is_left_alone():
     rng = np.random.default_rng(7)
     lens = np.array([460.0, 458.0, 367.0, 248.0, -0.30, 0.12, 4e-4, -2e-4])
     for _ in range(10):
-        agreement = LensAgreement("radtan")
+        agreement = LensAgreement()
         for k, (innovation, by_pose, by_lens) in enumerate(images_of(rng, lens, 0.0, 0.5)):
-            agreement.learn(0.6 * k, innovation, by_pose, by_lens, lens)
+            agreement.learn(0.6 * k, innovation, by_pose, by_lens, camera_of(lens))
         np.testing.assert_array_equal(agreement.moved, 0.0)
 
 
 def test_corners_in_one_line_say_what_they_can():
     rng = np.random.default_rng(8)
-    agreement = LensAgreement("radtan")
+    agreement = LensAgreement()
     for k in range(20):
         by_pose, by_lens = rng.standard_normal((20, 6)), rng.standard_normal((20, 8))
         by_pose[:, 0] = 0.0  # a turn about the line moves no corner
-        agreement.learn(1.0 * k, rng.standard_normal(20), by_pose, by_lens, LENS)
+        agreement.learn(1.0 * k, rng.standard_normal(20), by_pose, by_lens, camera_of(LENS))
     assert np.isfinite(agreement.factors).all() and np.isfinite(agreement.moved).all()
 
 
 def test_a_stretch_that_says_nothing_is_no_evidence():
     rng = np.random.default_rng(9)
-    agreement = LensAgreement("radtan")
+    agreement = LensAgreement()
     for stretch in range(8):
         weight = 1e-9 if stretch in (2, 6) else 1.0  # seen from so far that only the pose fits
         for k in range(6):
             by_pose, by_lens = rng.standard_normal((40, 6)), weight * rng.standard_normal((40, 8)) / SIZE
-            agreement.learn(5.0 * stretch + 0.5 * k, rng.standard_normal(40), by_pose, by_lens, LENS)
+            agreement.learn(
+                5.0 * stretch + 0.5 * k, rng.standard_normal(40), by_pose, by_lens, camera_of(LENS)
+            )
     np.testing.assert_array_equal(agreement.factors, 1.0)
