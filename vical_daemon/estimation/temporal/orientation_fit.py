@@ -1,8 +1,9 @@
 """The final polish of temporal calibration: all orientation sensors jointly against one rotation curve.
 
 Shifts, mountings, worlds, gyro bias and the drift of the integrated gyro are one least-squares problem (see
-`orientation_problem` and `drift_smoother`). How large the noises are is itself estimated (`estimate_scales`),
-so that the sigmas that come out are those the data support.
+`orientation_problem` and `drift_smoother`); pairs of closest points are not used any more. How large the
+noises are is itself estimated (`estimate_scales`), so that the sigmas that come out are those the data
+support.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@ Two sensors on one rigid body trace the same curve in the rotation group, one of
 mounting. Registering the curves gives the delay and the mounting from 5 to 10 s of hand motion; neither needs
 to be known beforehand, and positions play no part. `t_imu = t_cam + timeshift_cam_imu_s`.
 
-Stages: `rotation_start` (coarse start over several seconds, mounting), then `orientation_fit` (joint polish
-with the covariance of gyro integration). Of several sensors each is registered alone, then all are polished
-together, so that they share one drift of the reference and the delays between any two come with their
-covariance. See docs/math/td_icp.md.
+Stages: `rotation_start` (coarse start over several seconds, mounting), `rotation_registration` (closest
+points), then `orientation_fit` (joint polish with the covariance of gyro integration). Of several sensors
+each is registered alone, then all are polished together, so that they share one drift of the reference and
+the delays between any two come with their covariance. See docs/math/td_icp.md.
 """
 
 from __future__ import annotations
@@ -17,13 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.robust import geman_mcclure_weight
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
-from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve, RotationCurve
+from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve
 from vical_daemon.estimation.temporal.rotation_reference import GyroReference, Reference, StreamReference
-from vical_daemon.estimation.temporal.rotation_start import Start
+from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
 from vical_daemon.estimation.temporal.rotation_suspects import explain
 from vical_daemon.estimation.temporal.td_icp_input import (
     USUAL_RAD,
@@ -59,7 +57,6 @@ __all__ = [
 ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
 _DOUBTFUL_RAD = float(np.deg2rad(0.5))
 """Noise of one orientation above which the usual mistakes are tried out."""
-_WORLD_RAD = 0.2  # orientations that miss the usual one by more count less and less
 _MOST = 3000  # orientations of several sensors in all; more would add minutes and little accuracy
 
 
@@ -140,7 +137,7 @@ def joint_of_orientations(
 
 
 def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) -> TdIcpResult:
-    """Register one sensor: start, then polish; or the reason why not."""
+    """Register one sensor: start, closest points, polish; or the reason why not."""
     reach = (options.timeshift_guess_s - options.search_s, options.timeshift_guess_s + options.search_s)
     motion = refuse_motion(reference, data.t_s, data.q, options)
     if motion.reason:
@@ -154,13 +151,15 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
     reason = refuse_start(start, options)
     if start is None or reason:
         return _refused(data, mistake() or reason)
-    R_world_ref, near = _world(reference.curve(bias), data, start)
+    curve = reference.curve(bias)
+    rough = closest_point_registration(curve, data.t_s, data.q, replace(start, bias_rps=np.zeros(3)))
     sensor = OrientationSensor(
-        data.t_s, data.R_world_sensor, data.covariance, start.timeshift_s, start.R_imu_cam, R_world_ref, near
-    )
+        data.t_s, data.R_world_sensor, data.covariance, rough.timeshift_s, rough.R_imu_cam, rough.R_world_ref,
+        rough.weight > 0.2,
+    )  # fmt: skip
     try:
-        fit = polish(reference.curve, (sensor,), bias, options)
-        result = _result(fit, 0, reference, data)
+        fit = polish(reference.curve, (sensor,), bias + rough.bias_rps, options)
+        result = _result(fit, 0, reference, data, rough.iterations)
         result = _refused(data, result.reason) if result.status == REFUSED else result
     except np.linalg.LinAlgError:
         result = _refused(data, f"the orientations do not fit the {reference.name} at any delay")
@@ -169,18 +168,6 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
         return result
     reason = mistake()
     return _refused(data, reason) if reason else result
-
-
-def _world(curve: RotationCurve, data: CleanStream, start: Start) -> tuple[FloatArray, BoolArray]:
-    """Robust mean of `R_world_ref` by all orientations (3, 3), and which of them are near it (n,)."""
-    R_ref_imu = so3.matrix_from_quat(curve.quaternion(data.t_s + start.timeshift_s))
-    worlds = data.R_world_sensor @ np.swapaxes(R_ref_imu @ start.R_imu_cam, 1, 2)
-    weight = np.ones(len(worlds))
-    for _ in range(10):
-        mean = so3.nearest_rotation(np.einsum("k,kij->ij", weight, worlds))
-        off = so3.log(worlds @ mean.T)
-        weight = geman_mcclure_weight(np.vecdot(off, off) / _WORLD_RAD**2)
-    return mean, weight > 0.2
 
 
 def _joint(
@@ -233,8 +220,8 @@ def _refused(data: CleanStream, reason: str, *, still: bool = False) -> TdIcpRes
     return TdIcpResult(REFUSED, reason, rejected=data.n_given, at_rest=data.at_rest, still=still)
 
 
-def _result(fit: Fit, i: int, reference: Reference, data: CleanStream) -> TdIcpResult:
-    """What the fit says of sensor `i`, whose orientations are `data`."""
+def _result(fit: Fit, i: int, reference: Reference, data: CleanStream, rounds: int = 0) -> TdIcpResult:
+    """What the fit says of sensor `i`, whose orientations are `data`; `rounds` were needed before."""
     sensor, S = fit.sensors[i], len(fit.sensors)
     tau, (low, high) = sensor.t_s + sensor.timeshift_s, reference.span_s
     took_part = sensor.used & (tau >= low) & (tau <= high)
@@ -255,7 +242,7 @@ def _result(fit: Fit, i: int, reference: Reference, data: CleanStream) -> TdIcpR
         pairs=pairs,
         rejected=data.n_given - pairs,
         at_rest=data.at_rest,
-        iterations=fit.rounds,
+        iterations=rounds + fit.rounds,
         camera_noise_rad=sensor.noise_rad,
         used=used,
         stamp_rate=float(fit.stamp_rate[i]),

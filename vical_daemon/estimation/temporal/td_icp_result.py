@@ -34,7 +34,7 @@ class TdIcpResult:
         pairs: Orientations that took part.
         rejected: Orientations refused as outliers or without imu data at their time.
         at_rest: Of the rejected, those left out because the rig rested for most of the recording.
-        iterations: Rounds of the least squares.
+        iterations: Rounds of both iterative phases.
         camera_noise_rad: Measured noise of one orientation, rms per axis, rad (from tracks: of one feature).
         used: Which of the given orientations took part, shape (n,).
         stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
