@@ -337,8 +337,7 @@ class CalibrationFilter:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
         ways, by_error, by_shared = fit.ways, lin.by_error, lin.by_shared
-        rolling = is_rolling(self.state, self.layout, image.camera)
-        if lin.curved.size or rolling:  # by sigma points: the ways are not those of the camera
+        if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
             ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep] * fit.noise, 2)[:, None]
             by_shared = by_error @ shared_ways(self.state, self.layout, image.camera)

@@ -146,14 +146,10 @@ def by_sigma_points(
 ) -> Linear:
     """Statistical linearisation about `dx` with spread S (all in the chart of the prior).
 
-    The sigma points are those of the errors that move the image; whatever the rest does, it stays the same.
     Derivatives refer to the rows at which corners are expected: at the measured rows they would contain the
     noise of the corners, and pass for information. The mean refers to the measured rows.
     """
-    seen = layout.seen_by(image.camera)
-    L = unscented.lower_root(S[seen])
-    errors = np.zeros((2 * len(seen) + 1, layout.size))
-    errors[:, seen] = dx[seen] + unscented.offsets(L)
+    errors = dx + unscented.offsets(S)
     project = partial(project_errors, state, layout, rates, image.camera, image.t_cam_s, image.points)
     if is_rolling(state, layout, image.camera):
         pixels = project(project(None, errors[:1])[0], errors)
@@ -164,10 +160,10 @@ def by_sigma_points(
         valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
-    by_error = np.zeros((len(seen), layout.size))  # the columns of L are the ways
-    by_error[:, seen] = unscented.solve_lower(L, unscented.unit(len(seen)))
-    z, none = (flat[0] + m.shift).reshape(-1, 2), np.zeros((len(seen), 0))
-    return Linear(z, m.linear, by_error, by_error @ S, m.curved, valid, none)
+    # the columns of S are the ways
+    by_error = unscented.solve_lower(S, np.eye(len(S)))
+    unit, none = np.eye(len(S)), np.zeros((len(S), 0))
+    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, unit, m.curved, valid, none)
 
 
 def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:

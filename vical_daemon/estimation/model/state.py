@@ -111,12 +111,6 @@ class Layout:
         ones = [place for place in (where.timeshift, where.skew, where.readout) if place is not None]
         return [*np.concatenate([*places, ones]).astype(int).tolist()]
 
-    def seen_by(self, camera: str) -> list[int]:
-        """Where the errors lie that move an image of a camera: motion, camera, target."""
-        motion, target = np.r_[MOTION], np.r_[self.target_shape or slice(0, 0)]
-        scale = [] if self.target_scale is None else [self.target_scale]
-        return [*motion.tolist(), *self.errors_of(camera), *scale, *target.tolist()]
-
     def lens_free(self, camera: str) -> bool:
         """Whether a lens is estimated, not held."""
         return self.cameras[camera].intrinsics is not None and camera not in self.held

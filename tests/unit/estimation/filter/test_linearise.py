@@ -93,24 +93,6 @@ def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     assert straight.curved.shape == (2 * len(image.points), 0)
 
 
-def test_sigma_points_are_those_of_the_errors_that_move_the_image():
-    """What the imu may be off by only correlates with them: its own sigma points would all see the same."""
-    state, layout, rates, image = scene("radtan", frozenset({"target_scale", "imu_intrinsics", "accel_lag"}))
-    seen = layout.seen_by("cam0")
-    others = np.ones((2, layout.size))
-    others[:, seen] = others[0] = 0.0
-    one, other = project_errors(state, layout, rates, "cam0", image.t_cam_s, image.points, None, others)
-    np.testing.assert_array_equal(one, other)
-    rng = np.random.default_rng(8)
-    S = 1e-6 * np.tril(rng.standard_normal((layout.size, layout.size))) + 1e-5 * np.eye(layout.size)
-    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
-    straight = by_derivatives(state, layout, rates, image, S)
-    assert points.ways.shape[1] == len(seen) < layout.size
-    np.testing.assert_allclose(
-        points.ways @ points.spread, straight.ways @ straight.spread, rtol=1e-4, atol=1e-7
-    )
-
-
 def test_rows_of_a_rolling_shutter_put_no_noise_of_the_corners_into_derivatives():
     """An image of which only the noise differs has the same derivatives: noise is no information."""
     state, layout, rates, image = scene("radtan")
