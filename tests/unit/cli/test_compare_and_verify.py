@@ -137,7 +137,10 @@ def test_mistakes_are_one_line(capsys, args, code, line):
 
 @needs_euroc
 def test_euroc_published_calibration_is_found_wrong(capsys):
-    """It differs by 6 to 8 mm and 0.5 deg from what the corners say; 28 s show it."""
+    """It differs by 6 to 8 mm from what the corners say; 34 s show it.
+
+    With four coefficients for a lens that has more, 18 s did, with sigmas two to three times too small.
+    """
     code, out, _ = run(
         capsys,
         "verify",
@@ -151,7 +154,7 @@ def test_euroc_published_calibration_is_found_wrong(capsys):
     document = json.loads(out)
     assert code == 4
     assert document["verdict"] == "changed"
-    assert document["seconds_used"] < 20.0
+    assert document["seconds_used"] < 40.0
     assert document["probability_changed"] > 0.98  # odds of 1000 and a prior of 5 %
 
 
