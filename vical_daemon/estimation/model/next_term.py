@@ -35,7 +35,9 @@ def onto_model(camera: CameraState, seen: FloatArray) -> FloatArray:
         return np.eye(n)
     by = lens_slopes(*rounded(camera)).reshape(-1, n)
     N = seen + _UNSEEN_PX**-2.0 * by.T @ by
-    return np.concatenate([np.eye(n - 1), np.linalg.solve(N[:-1, :-1], N[:-1, -1:])], axis=1)
+    # least squares: of a lens that is far off, no patch may have rays, and N may be zero
+    moved = np.linalg.lstsq(N[:-1, :-1], N[:-1, -1:], rcond=None)[0]
+    return np.concatenate([np.eye(n - 1), moved], axis=1)
 
 
 def reported_camera(camera: CameraState, onto: FloatArray) -> CameraState:

@@ -65,19 +65,13 @@ def camera_estimate(
     n = 4 + len(camera.distortion)
     onto = np.eye(n - camera.term, n)
     camera = reported_camera(camera, onto)
-    lens, joint = (
-        np.concatenate([camera.intrinsics, camera.distortion]),
-        models.factor * joint_covariance(S, where, onto),
-    )
+    lens = np.concatenate([camera.intrinsics, camera.distortion])
+    joint = models.factor * joint_covariance(S, where, onto)
     if held is not None:
         joint[:3, :3] += held_covariance(np.outer(held, held))
     lens_sigma = np.sqrt(np.diag(joint)[7:])
     if fixed is not None:
-        n = len(lens)
-        lens, lens_sigma = (
-            fixed.values[:n],
-            fixed.reported(np.pad(lens_sigma, (0, len(fixed.values) - n)))[:n],
-        )
+        lens, lens_sigma = fixed.values[: len(lens)], fixed.reported(lens_sigma)
     return camera_snapshot(
         camera,
         joint=joint,
