@@ -214,8 +214,9 @@ def _ends(parent: subprocess.Popen[str], number: signal.Signals) -> None:
 
 def test_no_child_outlives_a_hang_up(daemon: Daemon) -> None:
     parent = daemon.vical("run")
-    _running(daemon, parent)
+    children = _running(daemon, parent)
     _ends(parent, signal.SIGHUP)
+    assert parent.returncode == 0 and not _alive(children)
 
 
 def test_a_second_interrupt_hurries_and_leaves_nobody(daemon: Daemon) -> None:
