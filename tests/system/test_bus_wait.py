@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,47 @@ def test_a_bus_that_comes_later_is_joined(tmp_path: Path, port: int, capsys) -> 
     assert capsys.readouterr().err.count("vical: waiting: no bus at tcp/127.0.0.1:") == 1
     found[0].close()
     host.close()
+
+
+def test_a_router_that_is_not_ready_yet_is_asked_again(tmp_path: Path) -> None:
+    """Something accepts and closes connections at first, as a router on a busy computer may when it starts."""
+    path, hosts, refused = tmp_path / "zenoh.sock", [], []
+    starting = socket.socket(socket.AF_UNIX)
+    starting.bind(str(path))
+    starting.listen()
+
+    def start() -> None:
+        for _ in range(2):
+            connection, _ = starting.accept()
+            connection.close()
+            refused.append(connection)
+        starting.close()
+        hosts.append(open_bus(mode="router", socket=path))
+
+    starts = threading.Thread(target=start)
+    starts.start()
+    client = open_bus(mode="client", socket=path)
+    starts.join(60)
+    assert len(refused) == 2 and len(hosts) == 1
+    client.close()
+    hosts[0].close()
+
+
+def test_what_refuses_for_good_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "zenoh.sock"
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+        other.listen()
+        threading.Thread(target=_close_every_connection, args=(other,), daemon=True).start()
+        with pytest.raises(BusError, match="a router is there but refuses us"):
+            open_bus(mode="client", socket=path)
+        other.shutdown(socket.SHUT_RDWR)
+
+
+def _close_every_connection(listener: socket.socket) -> None:
+    with suppress(OSError):
+        while True:
+            listener.accept()[0].close()
 
 
 def test_watch_gives_up_when_its_time_is_over(port: int, capsys) -> None:

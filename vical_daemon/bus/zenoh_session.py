@@ -27,6 +27,9 @@ ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|wss|serial|unixsock-stream|unixpipe
 _PAYLOAD_LIMIT = 256 * 2**20
 RETRY = {"retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}}
 """How a session reconnects to its router."""
+_STARTING_MS = 3000
+"""How long a client tries again where something accepts connections but refuses a session, ms. A router that
+starts on a busy computer does so for a moment. A wrong password is reported after this time."""
 _POOL_BYTES = 4 * 2**20
 """Shared memory of a router, bytes: three images of 1.3 MP. Every receiver of the same user locks it, so it
 stays below the usual limit of 8 MiB of other programs. Images that do not fit are copied."""
@@ -181,7 +184,7 @@ def open_session(config: dict[str, Any]) -> Any:
     if not shared:
         _warn_of_copies()
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        return _open(config)
     except zenoh.ZError as error:
         text = str(error)
         if not shared or ("shm" not in text.lower() and "shared memory" not in text.lower()):
@@ -189,9 +192,20 @@ def open_session(config: dict[str, Any]) -> Any:
     _warn_of_copies()  # /dev/shm is missing or full
     config["transport"]["shared_memory"] = {"enabled": False}
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        return _open(config)
     except zenoh.ZError as error:
         raise BusError(_explain(config, str(error))) from None
+
+
+def _open(config: dict[str, Any]) -> Any:
+    """Open a session; a client tries again for a while if its router is there but not ready yet."""
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError:
+        if config["mode"] != "client" or not any(map(_answers, config["connect"]["endpoints"])):
+            raise
+    patient = config | {"connect": config["connect"] | {"timeout_ms": _STARTING_MS}}
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(patient)))
 
 
 def _explain(config: dict[str, Any], text: str) -> str:
