@@ -49,7 +49,7 @@ def test_a_bus_that_comes_later_is_joined(tmp_path: Path, port: int, capsys) -> 
 
 
 def test_a_router_that_is_not_ready_yet_is_asked_again(tmp_path: Path) -> None:
-    """Something accepts and closes connections at first, as a router on a busy computer may when it starts."""
+    """Something accepts and closes connections at first, as a router may while it starts."""
     path, hosts, refused = tmp_path / "zenoh.sock", [], []
     starting = socket.socket(socket.AF_UNIX)
     starting.bind(str(path))
