@@ -1,4 +1,4 @@
-"""The order of the whole run: `pytest -n 4` gives files to whoever is free, so the long ones go first.
+"""The order of the whole run: `pytest -n auto` gives files to whoever is free, so the long ones go first.
 
 A test marked `root` is skipped for everybody else.
 """
@@ -75,6 +75,12 @@ LONGEST_FIRST = (  # one that mostly waits, then two that compute: `pytest --dur
     "test_calibration_statistics.py",
     "test_consistency.py",
 )
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Workers of `pytest -n auto`: two more than processors, as some files mostly wait; a dozen are long."""
+    return min(len(os.sched_getaffinity(0)) + 2, 12)
 
 
 def pytest_configure(config: pytest.Config) -> None:
