@@ -15,7 +15,7 @@ demo: $(VENV)/.user
 	$(BIN)/vical demo --out demo_out
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -q $(PYTEST_ARGS) tests
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -q $(PYTEST_ARGS) tests
 
 check: $(VENV)/.check
 	$(BIN)/ruff check .

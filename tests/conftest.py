@@ -1,4 +1,4 @@
-"""The order of the whole run: `pytest -n 4` gives files to whoever is free, so the long ones go first.
+"""The order of the whole run: `pytest -n auto` gives files to whoever is free, so the long ones go first.
 
 A test marked `root` is skipped for everybody else.
 """
@@ -6,6 +6,8 @@ A test marked `root` is skipped for everybody else.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -26,6 +28,8 @@ LONGEST_FIRST = (  # one that mostly waits, then two that compute: `pytest --dur
     "test_gaps.py",
     "test_shared_memory.py",
     "test_changes.py",
+    "test_late_camera.py",
+    "test_mounting_changes.py",
     "test_several_recordings.py",
     "test_bus_access.py",
     "test_euroc.py",
@@ -53,6 +57,8 @@ LONGEST_FIRST = (  # one that mostly waits, then two that compute: `pytest --dur
     "test_calibration_with_junk.py",
     "test_foxglove_live.py",
     "test_window_start.py",
+    "test_wrong_lens.py",
+    "test_target_free_rig.py",
     "test_free_partial.py",
     "test_calibrate_traffic.py",
     "test_any_numbers.py",
@@ -62,6 +68,15 @@ LONGEST_FIRST = (  # one that mostly waits, then two that compute: `pytest --dur
     "test_start.py",
     "test_another_gx3.py",
     "test_half_turn.py",
+    "test_report.py",
+    "test_split_recording.py",
+    "test_readout_start.py",
+    "test_detector.py",
+    "test_recording.py",
+    "test_pending_change.py",
+    "test_td_icp.py",
+    "test_td_icp_sensors.py",
+    "test_td_icp_command.py",
     "test_target_free_parts.py",
     "test_replaced_device.py",
     "test_structure.py",
@@ -75,9 +90,33 @@ LONGEST_FIRST = (  # one that mostly waits, then two that compute: `pytest --dur
 )
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Workers of `pytest -n auto`: two more than processors, as some files mostly wait; a dozen are long."""
+    return min(len(os.sched_getaffinity(0)) + 2, 12)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let each worker of xdist begin to collect at another file.
+
+    Every worker collects all files. Where there is no bytecode yet, pytest compiles each and rewrites its
+    assertions. So the workers share that work: what one comes to later, another has compiled.
+    """
+    worker = getattr(config, "workerinput", None)
+    folders = [Path(arg) for arg in config.args]
+    if worker is None or not all(folder.is_dir() for folder in folders):
+        return
+    files = sorted({str(file) for folder in folders for file in folder.rglob("test_*.py")})
+    first = len(files) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
+    config.args = files[first:] + files[:first]
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Iterator[None]:
     """Put the longest files first (a stable sort: within a file, and after them, the order stays random)."""
+    if hasattr(config, "workerinput"):  # each began at another file, and xdist wants one order
+        items.sort(key=lambda item: item.path)
+    yield
     rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 

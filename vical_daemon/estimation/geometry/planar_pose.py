@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, median
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
@@ -143,7 +143,7 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
     Args:
         far: Distance of each point from its place, shape (n,).
     """
-    sigma = np.median(far) / MEDIAN_RAYLEIGH
+    sigma = median(far) / MEDIAN_RAYLEIGH
     return np.asarray(far <= SURE_SIGMAS * sigma)
 
 

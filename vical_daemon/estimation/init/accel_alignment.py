@@ -330,14 +330,14 @@ def _costs(e: Evidence, rows: FloatArray, shifts_s: FloatArray) -> tuple[FloatAr
     R = np.broadcast_to(_STARTS, (len(shifts_s), *_STARTS.shape)).copy()
     for _ in range(_DESCENTS):
         J = _tangent(R)
-        r = R.reshape(*R.shape[:2], 9)
-        gradient = np.einsum("skij,ski->skj", J, np.einsum("sij,skj->ski", A, r) - b[:, None])
-        H = np.einsum("skia,sij,skjb->skab", J, A, J)
+        Jt, r = np.swapaxes(J, 2, 3), R.reshape(*R.shape[:2], 9)
+        gradient = Jt @ (r @ A - b[:, None])[..., None]
+        H = Jt @ A[:, None] @ J
         damping = 1e-6 + 0.02 * np.einsum("skaa->sk", H)
-        step = -np.linalg.solve(H + damping[:, :, None, None] * np.eye(3), gradient[..., None])[..., 0]
+        step = -np.linalg.solve(H + damping[:, :, None, None] * np.eye(3), gradient)[..., 0]
         R = so3.exp(step) @ R
     r = R.reshape(*R.shape[:2], 9)
-    cost = np.einsum("ski,sij,skj->sk", r, A, r) - 2.0 * np.einsum("si,ski->sk", b, r)
+    cost = np.vecdot(r @ A - 2.0 * b[:, None], r)
     at, each = np.argmin(cost, axis=1), np.arange(len(shifts_s))
     return cost[each, at] + np.array([p.c for p in problems]), R[each, at]
 

@@ -134,9 +134,9 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
     rough: dict[str, RotationsKnown] = {}
     turn_axis_cam: FloatArray | None = None
     refused = StartResult(None, reason, motion_missing=True)
-    for name, (lens, frames, _) in seen.items():
+    for name, (lens, _, known) in seen.items():
         since_s = data.frames[name][-1][0] - LONG_S
-        poses = usable_poses([x for x in frames if x[0] > since_s], lens, data.target)
+        poses = [p for p in known if p.t_cam_s > since_s]
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < PARTIAL_S:
             return refused
         path = CameraPath(

@@ -13,7 +13,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.robust import geman_mcclure_weight
+from vical_daemon.estimation.robust import geman_mcclure_weight, median
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, angles_between
 
@@ -148,7 +148,7 @@ def _register(
     weight = np.ones(len(e))
     for _ in range(4):
         r = np.linalg.norm(e - J @ x, axis=1)
-        scale = max(3.0 * float(np.median(r)), 1e-6)
+        scale = max(3.0 * median(r), 1e-6)
         weight = geman_mcclure_weight((r / scale) ** 2)
         JtW = np.swapaxes(J * weight[:, None, None], 1, 2)
         A = np.einsum("kai,kib->ab", JtW, J)
