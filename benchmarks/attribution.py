@@ -46,6 +46,12 @@ def _exact(rig: Rig, rng: np.random.Generator) -> Rig:  # noqa: ARG001
     return rig
 
 
+def _axes_apart(rig: Rig, rng: np.random.Generator) -> Rig:
+    """About as in EuRoC's ADIS16448, axes in any order; their mean is what the lever arm refers to."""
+    positions = [[-5e-3, 8e-3, -1e-3], [2e-3, -4e-3, 0.0], [3e-3, -4e-3, 1e-3]]
+    return replace(rig, accel_positions=rng.permutation(positions))
+
+
 def _matrices(size: float, rig: Rig, rng: np.random.Generator) -> Rig:
     """Scale and alignment off by `size`, one sigma; what of the gyro's is no turn of the imu's frame."""
     G, A = size * rng.standard_normal((2, 3, 3))
@@ -147,6 +153,7 @@ CASES: dict[str, Case] = {
     "imu 0.3 %": _is(Kind.IMU_INTRINSICS, rig=partial(_matrices, 3e-3)),
     "imu 1 %": _is(Kind.IMU_INTRINSICS, rig=partial(_matrices, 1e-2)),
     "accelerometer 1 ms late": _is(Kind.ACCEL_LAG, simulation={"accel_lag_s": 1e-3}),
+    "accelerometer axes 11 mm apart": _is(Kind.ACCEL_POSITIONS, rig=_axes_apart),
     "rows read in 20 ms": _is(Kind.ROLLING_SHUTTER, rig=_rolling("rows")),
     "columns read in 20 ms": _is(Kind.ROLLING_COLUMNS, rig=_rolling("columns")),
     "clocks 100 ppm apart": _is(Kind.CLOCK_DRIFT, rig=partial(_apart, 100.0, 0.0)),

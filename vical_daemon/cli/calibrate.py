@@ -66,8 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "--estimate",
         metavar="WHAT",
         default="",
-        help="comma-separated, estimated from the start, not only if the data require it (size_effect, the "
-        "positions of the accelerometer's axes: only if asked for): " + ", ".join(ESTIMATE),
+        help="comma-separated, estimated from the start, not only if the data require it (size_effect: the "
+        "positions of the accelerometer's axes): " + ", ".join(ESTIMATE),
     )
     add_stretch(parser)
     parser.add_argument(

@@ -43,6 +43,7 @@ class EventKind(StrEnum):
     IMU_NOISE = "imu_noise"
     IMU_INTRINSICS = "imu_intrinsics"
     ACCEL_LAG = "accel_lag"
+    ACCEL_POSITIONS = "accel_positions"
     TARGET_SIZE = "target_size"
     TARGET_SHAPE = "target_shape"
     FIXED_LENS = "fixed_lens"
@@ -322,6 +323,12 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.ACCEL_LAG: About(
         "The accelerometer lags (+) or leads (-) the gyro; allowed for. Value: by how much.",
         "s",
+        "Once, at a probability above 99 %.",
+    ),
+    EventKind.ACCEL_POSITIONS: About(
+        "The axes of the accelerometer are not in one place (size effect); allowed for. Value: how far apart "
+        "they are, the most certain component.",
+        "m",
         "Once, at a probability above 99 %.",
     ),
     EventKind.TARGET_SIZE: About(

@@ -95,7 +95,7 @@ class CameraEstimate:
 class ImuEstimate:
     """Inertial biases and, where estimated, scale and misalignment, in the imu frame.
 
-    `accel_positions_m`: of the accelerometer's axes x, y, z, where asked for; not on the bus.
+    `accel_positions_m`: of the accelerometer's axes x, y, z, if known to be apart or asked for; not on a bus.
     """
 
     gyro_bias_rps: list[float]

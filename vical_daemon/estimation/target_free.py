@@ -25,7 +25,7 @@ from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
-from vical_daemon.estimation.selection.model_selection import IMU, LAG
+from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
@@ -53,7 +53,7 @@ _MIN_PARALLAX_DEG = 0.4  # usual angle under which a landmark is seen: ten times
 _KEEP_S = 12.0  # of images that wait for a start or for inertial data
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _STEPS_GROW = 12  # Gauss-Newton steps for a window that grows; twice as many for its last fit
-_ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
+_ALWAYS = frozenset({IMU, LAG, SIZE_EFFECT, "readout"})  # is estimated besides what is asked for
 
 
 class TargetFreeCalibrator:
@@ -81,7 +81,7 @@ class TargetFreeCalibrator:
         self.layout = make_layout(
             {self.camera: prior.distortion_model},
             fix=options.fix,
-            estimate=_ALWAYS | ({"size_effect"} & options.estimate),
+            estimate=_ALWAYS,
             held=None if lens is None else {self.camera: lens},
             core=CORE,
         )

@@ -30,7 +30,7 @@ _ORDER = (
 )
 
 # About the imu, but estimated by each camera: the figures differ.
-_EACH_BY_ITSELF = {EventKind.IMU_INTRINSICS, EventKind.ACCEL_LAG}
+_EACH_BY_ITSELF = {EventKind.IMU_INTRINSICS, EventKind.ACCEL_LAG, EventKind.ACCEL_POSITIONS}
 
 
 class TargetFreeRig:

@@ -444,6 +444,13 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         ),
     ),
     EventKind.ACCEL_LAG: ("", _accel_lag),
+    EventKind.ACCEL_POSITIONS: (
+        "",
+        lambda e: (
+            "the axes of the accelerometer are not in one place (size effect), by "
+            f"{_size(e, 1e3, 'mm', '.1f')}: allowed for from now on"
+        ),
+    ),
     EventKind.TARGET_SIZE: ("", _target_size),
     EventKind.TARGET_SHAPE: (
         "",

@@ -79,11 +79,11 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
 
 
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
-    """Biases and, where asked for, the matrices."""
+    """Biases; where asked for, the matrices; positions of the accelerometer's axes if known to be apart."""
     sigma, state = f.sigmas(), f.state
     return imu_snapshot(
         np.concatenate([state.gyro_bias, state.accel_bias]),
         np.concatenate([sigma[GYRO_BIAS], sigma[ACCEL_BIAS]]),
         (state.gyro_matrix, state.accel_matrix) if matrices else (),
-        None if f.layout.accel_positions is None else state.accel_positions,
+        state.accel_positions if "size_effect" in f.off else None,
     )

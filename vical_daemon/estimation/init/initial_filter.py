@@ -41,7 +41,7 @@ from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors
-from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET
+from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, SIZE_EFFECT, TARGET
 
 
 def initial_filter(
@@ -69,7 +69,7 @@ def initial_filter(
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    off = {IMU, LAG, SIZE, TARGET} & options.estimate
+    off = {IMU, LAG, SIZE, SIZE_EFFECT, TARGET} & options.estimate
     root = np.diag(filter_sigmas(state, layout, off))
     unobservable = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
     if unobservable is not None:

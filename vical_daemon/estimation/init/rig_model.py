@@ -43,6 +43,8 @@ class RigModel:
         self.turns = HalfTurns(target_points_m, alike=options.target_alike)
         self._held = self._held_lenses()
         self._states = options.estimate | _ALWAYS
+        if "intrinsics" not in options.fix:  # else what is reported for a wrong lens would be far off
+            self._states |= {model_selection.SIZE_EFFECT}
         if "intrinsics" not in options.fix or self._held:  # else a wrong lens would look like a bent target
             self._states |= {model_selection.TARGET}
         self.layout = self._lay_out()

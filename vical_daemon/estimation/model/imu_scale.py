@@ -5,8 +5,7 @@ traded against the mounting of the camera. Entries are those of M_g - I, row by 
 An axis of the accelerometer at r measures alpha x r + omega x (omega x r) besides the force at the origin
 ("size effect") [Rehder et al., "Extending kalibr", 2016]. The origin is the mean of the three positions: what
 they have in common could be traded against the lever arm of the camera.
-These positions are estimated only where they are asked for. The lag, s, is the last number: by how much the
-accelerometer is later than the gyro.
+The lag, s, is the last number: by how much the accelerometer is later than the gyro.
 """
 
 from __future__ import annotations
@@ -18,15 +17,10 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
 ENTRIES = 15  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
-APART = slice(ENTRIES, -1)  # m, positions of the accelerometer's axes; none where they are not estimated
-_POSITIONS = 6  # numbers of them
+APART = slice(ENTRIES, -1)  # m, positions of the accelerometer's axes; none without a start
+NUMBERS = ENTRIES + 6 + 1
 # Positions of three axes whose mean is zero, by two vectors; orthonormal, so that no axis is special.
 _SPREAD = np.array([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]) / np.sqrt([2.0, 6.0])
-
-
-def count(*, size_effect: bool) -> int:
-    """How many there are, with positions of the accelerometer's axes or without."""
-    return ENTRIES + _POSITIONS * size_effect + 1
 
 
 def numbers_of(state: State) -> FloatArray:

@@ -93,7 +93,7 @@ def imu_snapshot(
         bias: Of gyro (rad/s) and accelerometer (m/s^2), shape (6,).
         sigma: Standard deviations, shape (6,).
         matrices: M_g and M_a where they are asked for, shape (3, 3) each.
-        positions_m: Of the accelerometer's axes where they are asked for, shape (3, 3).
+        positions_m: Of the accelerometer's axes where they are asked for or known to be apart, shape (3, 3).
     """
     blocks = [np.asarray(x).tolist() for x in (bias[:3], bias[3:], sigma[:3], sigma[3:])]
     found = ImuEstimate(*blocks, *(m.tolist() for m in matrices))

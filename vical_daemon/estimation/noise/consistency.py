@@ -139,6 +139,7 @@ class Consistency:
     _level: float = 1.0
     _skip: int = _SETTLE
     _weight: float = 0.0
+    _lasting: float = 0.0  # excess of the long-run variance over its standard deviation
     _short: float = 0.0  # sum of the squared innovations of images
     _long: float = 0.0  # of squared sums of the innovations over 3 s, over the number of images in them
     _sum: FloatArray = field(default_factory=lambda: np.zeros(MODES))
@@ -183,8 +184,12 @@ class Consistency:
 
     @property
     def fits(self) -> bool:
-        """Enough images have been seen, and their errors neither last nor exceed their noise."""
-        return self._weight >= _TELLING and self.factor == self.scale == 1.0
+        """Enough images have been seen, and their errors neither last nor exceed their noise.
+
+        Errors that last are ruled out where the long-run variance is less than one standard deviation above
+        what the filter predicts; sigmas grow where it is `LIKELY_SIGMAS` above.
+        """
+        return self._weight >= _TELLING and self.scale == 1.0 and self._lasting < 1.0
 
     @property
     def level(self) -> float:
@@ -260,4 +265,5 @@ class Consistency:
         noise = math.sqrt(
             (4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight)
         )  # of white innovations
+        self._lasting = more / noise
         self.factor = 1.0 + more if more > max(LIKELY_SIGMAS * noise, _FLOOR) else 1.0

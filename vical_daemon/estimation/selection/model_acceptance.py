@@ -16,12 +16,22 @@ from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.shared_errors import MEMORY, TELLING
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens_block, not_zero, term_block
-from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
+from vical_daemon.estimation.selection.model_selection import (
+    IMU,
+    LAG,
+    SIZE,
+    SIZE_EFFECT,
+    TARGET,
+    blocks,
+    factor,
+    weights,
+)
 from vical_daemon.estimation.significance import EVERY_S
 
 _KINDS = {
     IMU: EventKind.IMU_INTRINSICS,
     LAG: EventKind.ACCEL_LAG,
+    SIZE_EFFECT: EventKind.ACCEL_POSITIONS,
     SIZE: EventKind.TARGET_SIZE,
     TARGET: EventKind.TARGET_SHAPE,
 }
@@ -32,7 +42,8 @@ def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
 
     Args:
         block: Its name.
-        values: Its states; for `SIZE` relative, for `LAG` s, for `TARGET` m at the edges.
+        values: Its states; for `SIZE` relative, for `LAG` s, for `SIZE_EFFECT` m, for `TARGET` m at the
+            edges.
         sigmas: Their standard deviations.
     """
     surest = int(np.argmax(np.abs(values) / sigmas))

@@ -10,7 +10,14 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.imu_scale import ENTRIES, numbers_of
-from vical_daemon.estimation.model.priors import ENTRY_SIGMA, FILTER_START, LAG_SIGMA_S, OFF, SIZE_SIGMA
+from vical_daemon.estimation.model.priors import (
+    APART_SIGMA_M,
+    ENTRY_SIGMA,
+    FILTER_START,
+    LAG_SIGMA_S,
+    OFF,
+    SIZE_SIGMA,
+)
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.selection import model_mixture
@@ -23,7 +30,8 @@ from vical_daemon.estimation.selection.model_mixture import (
     term_block,
 )
 
-IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
+IMU, LAG, SIZE_EFFECT = "imu_intrinsics", "accel_lag", "size_effect"
+SIZE, TARGET = "target_scale", "target_shape"
 IN_DOUBT = {
     IMU: "sigmas are small; it is not clear yet whether the IMU's scale and alignment are as specified",
     SIZE: "sigmas are small; it is not clear yet whether the target has the size in its file",
@@ -39,6 +47,8 @@ def imu_and_lenses(
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         where = slice(layout.gyro_matrix.start, layout.accel_matrix.stop)
         found[IMU] = Block.of(where, numbers[:ENTRIES], ENTRY_SIGMA)
+    if layout.accel_positions is not None:
+        found[SIZE_EFFECT] = Block.of(layout.accel_positions, numbers[ENTRIES:-1], APART_SIGMA_M)
     if layout.accel_lag is not None:
         where = slice(layout.accel_lag, layout.accel_lag + 1)
         found[LAG] = Block.of(where, numbers[-1:], LAG_SIGMA_S)

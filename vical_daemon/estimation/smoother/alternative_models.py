@@ -70,7 +70,7 @@ class AlternativeModels:
     ) -> None:
         (self._camera,) = layout.cameras
         self.lens = layout.held.get(self._camera)
-        self._off = asked & {model_selection.IMU, model_selection.LAG}
+        self._off = asked & {model_selection.IMU, model_selection.LAG, model_selection.SIZE_EFFECT}
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
@@ -111,6 +111,11 @@ class AlternativeModels:
         if name == term_block(self._camera):
             return Event(EventKind.LENS_TERM_MISSING, self._camera)
         return known_off(name, block.values, np.sqrt(np.diag(covariance)))
+
+    @property
+    def axes_apart(self) -> bool:
+        """Whether the axes of the accelerometer are known to be apart, or it is asked for."""
+        return model_selection.SIZE_EFFECT in self._off
 
     @property
     def lens_off(self) -> bool:

@@ -112,9 +112,8 @@ def _over_clocks(carry: MarginalPrior, models: ReportedModels) -> tuple[FloatArr
     return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def imu_estimate(carry: MarginalPrior, *, matrices: bool) -> ImuEstimate:
-    """Biases and their sigmas; where asked for, the matrices."""
+def imu_estimate(carry: MarginalPrior, *, matrices: bool = False, positions: bool = False) -> ImuEstimate:
+    """Biases and their sigmas; if wanted, matrices and positions of the accelerometer's axes."""
     sigma = np.sqrt(np.diag(carry.covariance())[BIASES])
-    apart = carry.imu[imu_scale.APART]
-    positions_m = imu_scale.positions_m(apart) if apart.size else None
+    positions_m = imu_scale.positions_m(carry.imu[imu_scale.APART]) if positions else None
     return imu_snapshot(carry.bias, sigma, matrices_of(carry.imu) if matrices else (), positions_m)

@@ -207,8 +207,8 @@ class TargetFreeInitializer:
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
         camera = camera_by_rotations(camera, prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         sigma = WINDOW_START.lever_arm_m if given is None else 1e-4
-        numbers = imu_scale.count(size_effect="size_effect" in self.options.estimate)
-        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + numbers)]), sigma, about)
+        imu = np.concatenate([best.gyro_bias, np.zeros(3 + imu_scale.NUMBERS)])
+        return _Found(camera, imu, sigma, about)
 
     def _seeds(
         self,

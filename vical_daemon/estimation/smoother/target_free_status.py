@@ -187,7 +187,7 @@ class TargetFreeStatus(Evaluator):
         self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))
         trace = self._trace[self.camera]
         if trace.due(t_s):
-            imu = imu_estimate(fit.carry, matrices=False)
+            imu = imu_estimate(fit.carry)
             trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status, imu)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
@@ -279,7 +279,7 @@ class TargetFreeStatus(Evaluator):
             self.believed &= not doubt
             reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
             cameras, missing = {self.camera: camera}, {self.camera: weak}
-            imu = imu_estimate(carry, matrices=self.models.imu_asked)
+            imu = imu_estimate(carry, matrices=self.models.imu_asked, positions=self.models.axes_apart)
         refused, seen = (sum(x) for x in zip((0, 0), *self._refused, strict=True))
         return self._put_together(
             reported,

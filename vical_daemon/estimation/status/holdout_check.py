@@ -17,7 +17,7 @@ from vical_daemon.estimation.measurements import FloatArray, MeasuredNoise, Poin
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.robust import median
 
-EVERY_S = 1.5  # between two predictions: five times their length, so that they share nothing
+HELD_BACK_EVERY_S = 1.5  # between two predictions: five times their length, so that they share nothing
 _AHEAD_S = 0.3  # of a prediction: noise of the readings then exceeds that of the corners
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
@@ -65,7 +65,7 @@ class HoldoutCheck:
         t_s = t_cam_s + held.state.cameras[frame.camera].timeshift_s
         if t_s < held.state.t_s + _AHEAD_S or len(frame.ids) < 8:
             return None
-        self._copy, self._next_s = None, t_s + EVERY_S
+        self._copy, self._next_s = None, t_s + HELD_BACK_EVERY_S
         segment = buffer.segment(held.state.t_s, t_s)
         if segment is None or segment.clipping_sigma is not None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None

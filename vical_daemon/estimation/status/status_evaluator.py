@@ -18,9 +18,10 @@ from vical_daemon.estimation.model.priors import OFF, SURE
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
+from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
 from vical_daemon.estimation.status.excitation import ALL_WAYS
-from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_error
+from vical_daemon.estimation.status.holdout_check import HELD_BACK_EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
 from vical_daemon.estimation.status.mounting_changes import (
     IRRELEVANT_M,
@@ -36,7 +37,7 @@ IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilis
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
-_KEPT_CHECKS = round(3600.0 / EVERY_S)  # of an hour
+_KEPT_CHECKS = round(3600.0 / HELD_BACK_EVERY_S)  # of an hour
 
 
 class StatusEvaluator(Evaluator):
@@ -204,10 +205,11 @@ class StatusEvaluator(Evaluator):
         for name, before in self._before.items():
             moved[name] = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
             lens[name] = lens_difference(name, before, now[name], self.elapsed_s)
-        if not self._named and not doubt and any(moved.values()):
+        since_s = t_s - max(self._started_s or 0.0, self._reopened_s)
+        # the first images after a change may not show yet that a lens explains them as well
+        if not self._named and not doubt and since_s >= EVERY_S and any(moved.values()):
             self._named = True
             self.announce_change(Cause.IMAGES_DISAGREE)
-        since_s = t_s - max(self._started_s or 0.0, self._reopened_s)
         visible_m = {name: visible_move_m(before, now[name]) for name, before in self._before.items()}
         well = since_s >= _ENOUGH_S or max(visible_m.values()) <= IRRELEVANT_M
         known = well and self.status == Status.CONVERGED

@@ -74,6 +74,18 @@ def test_larger_innovations_that_the_predicted_motion_dominates_raise_the_factor
     assert not c.fits
 
 
+def test_a_model_fits_only_where_errors_that_last_are_ruled_out():
+    """0.8 sigma in one direction: in 90 images too little to widen sigmas, too much to say that all fits."""
+    fits, factors = [], []
+    for seed in range(20):
+        c = Consistency()
+        feed(c, np.random.default_rng(seed), 90, common=np.tile(0.04 * np.eye(8)[0], (90, 1)))
+        fits.append(c.fits)
+        factors.append(c.factor)
+    assert factors.count(1.0) >= 15
+    assert fits.count(True) <= 5
+
+
 def test_whether_the_model_fits_is_not_known_from_a_few_images():
     c = Consistency()
     feed(c, np.random.default_rng(0), 30)

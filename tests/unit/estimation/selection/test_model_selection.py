@@ -178,10 +178,11 @@ def test_a_true_imu_pays_nothing(as_specified):
     assert shot.status == "converged"
 
 
-def test_an_accelerometer_whose_axes_are_apart_is_estimated_where_asked_for():
+@pytest.mark.parametrize("asked", [frozenset(), frozenset({"size_effect"})])
+def test_positions_of_an_accelerometers_axes_are_estimated_without_being_asked_for(asked):
     positions = np.array([[-5e-3, 8e-3, -1e-3], [2e-3, -4e-3, 0.0], [3e-3, -4e-3, 1e-3]])
     run = simulate(2, 20.0, rig=reference_rig(2, timeshift_cam_imu_s=0.01, accel_positions=positions))
-    options = CalibrationOptions(imu_noise=imu_noise(run), estimate=frozenset({"size_effect"}))
+    options = CalibrationOptions(imu_noise=imu_noise(run), estimate=asked)
     prior = camera_prior(run, 2, StartErrors(), exact_lens=False)
     subject = CalibratorSubject(options, prior, run.points_m)
     record = feed(run, subject)
@@ -190,7 +191,8 @@ def test_an_accelerometer_whose_axes_are_apart_is_estimated_where_asked_for():
     found = np.array(subject.calibrator.estimate().imu.accel_positions_m)
     np.testing.assert_allclose(found, positions, atol=4e-3)
     np.testing.assert_allclose(found.sum(axis=0), 0.0, atol=1e-12)
-    assert not record.events
+    announced = [e.kind for _, e in record.events]
+    assert announced == ([] if asked else [EventKind.ACCEL_POSITIONS])
 
 
 @pytest.mark.parametrize("late_ms", [-0.3, 0.3])
