@@ -44,6 +44,7 @@ class EventKind(StrEnum):
     IMU_INTRINSICS = "imu_intrinsics"
     ACCEL_LAG = "accel_lag"
     TARGET_SIZE = "target_size"
+    TARGET_RATIO = "target_ratio"
     TARGET_SHAPE = "target_shape"
     FIXED_LENS = "fixed_lens"
     ROLLING_SHUTTER = "rolling_shutter"
@@ -328,6 +329,12 @@ REFERENCE: dict[EventKind, About] = {
         "The target is larger (+) or smaller (-) than its file says; its size is estimated. Value: relative.",
         "1",
         "Once: during initialisation if it is far off, else at a probability above 99 %.",
+    ),
+    EventKind.TARGET_RATIO: About(
+        "The columns of the target are further apart (+) or closer together (-), compared with its rows, "
+        "than its file says; allowed for. Value: relative.",
+        "1",
+        "During initialisation, where they are by 2.4 % or more.",
     ),
     EventKind.TARGET_SHAPE: About(
         "The target is bent, or its print is distorted; its shape is estimated. Value: the most certain "
