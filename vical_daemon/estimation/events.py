@@ -230,7 +230,8 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.TIMESHIFT_STEPPED: About(
         "The time shift jumped; everything else is kept. Value: new minus old.",
         "s",
-        "When images have agreed with the new time shift for 3 s; target-free for 2 s.",
+        "When images have agreed with the new time shift for 3 s; target-free for 2 s. Not within 4 of the "
+        "sigmas that the IMU's driver states of its stamps.",
     ),
     EventKind.LENS_STEPPED: About(
         "The lens changed at once: focus or zoom was turned, or focuses by itself. A lens that is not "
