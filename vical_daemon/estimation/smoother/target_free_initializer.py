@@ -45,7 +45,7 @@ class _Found(NamedTuple):
 
 
 _REACH_S, _FAR_S = 2.0, 6.0  # time shifts that are looked for at first, and after `_USUAL` attempts
-_USUAL = 3
+_USUAL = 3  # attempts: a shift of seconds is rare, and a wider search costs time and finds false ones
 _SPAN_S = 5.0  # of images in the first attempt
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # likewise at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))  # of the mounting from rotations: a window converges from there
