@@ -7,10 +7,12 @@ missing. No I/O, no clock.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Container, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from vical_daemon.bus.messages import DiagnosticsMessage, Level
+from vical_daemon.bus.messages import DiagnosticsMessage, DiagnosticStatus, Level
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.service.liveness import FRESH_S
@@ -33,12 +35,14 @@ class _Device:
         age_s: Since something new came, or since the role began, s.
         ever: Something has come.
         repeats: Messages came since, with nothing new in them.
+        driven: Its driver says how old its last data are.
     """
 
     limit_s: float
     age_s: float = 0.0
     ever: bool = False
     repeats: bool = False
+    driven: bool = False
 
 
 class InputTrouble:
@@ -47,9 +51,11 @@ class InputTrouble:
     Args:
         imu: Name of the IMU.
         camera_rates_hz: Nominal rate of each camera, by name.
+        always: All data come here all the time. If not, what drivers say of their last data counts as well.
     """
 
-    def __init__(self, imu: str, camera_rates_hz: Mapping[str, float]) -> None:
+    def __init__(self, imu: str, camera_rates_hz: Mapping[str, float], *, always: bool = True) -> None:
+        self._always = always
         self._imu = f"imu/{imu}"
         self._devices = {self._imu: _Device(FRESH_S)}
         for name, rate_hz in camera_rates_hz.items():
@@ -79,15 +85,31 @@ class InputTrouble:
         for status in message.statuses:
             bad = status.level > Level.OK
             self._said[status.name] = status.message if bad else ""
+            if not self._always:
+                self._of_driver(status)
             if WRONG_TARGET in status.values:
                 self._wrong_target[status.name.partition("/")[2]] = status.values[WRONG_TARGET]
 
-    def look(self, now_s: float) -> None:
-        """Let time pass, by a steady clock, s."""
+    def _of_driver(self, status: DiagnosticStatus) -> None:
+        device = self._devices.get(status.name)
+        with suppress(KeyError, ValueError):
+            age_s = float(status.values["data_age_s"])
+            if device is not None:
+                device.driven, device.ever = True, device.ever or math.isfinite(age_s)
+                device.age_s = age_s if math.isfinite(age_s) else device.age_s
+
+    def look(self, now_s: float, listening: Container[str] = ()) -> None:
+        """Let time pass.
+
+        Args:
+            now_s: By a steady clock, s.
+            listening: Components whose data come here now, if not all do always.
+        """
         passed_s = 0.0 if self._looked_s is None else min(max(now_s - self._looked_s, 0.0), _TURN_S)
         self._looked_s = now_s
-        for device in self._devices.values():
-            device.age_s += passed_s
+        for name, device in self._devices.items():
+            if self._always or device.driven or name in listening:
+                device.age_s += passed_s
 
     @property
     def silent(self) -> dict[str, float]:
@@ -117,13 +139,17 @@ class InputTrouble:
         why = self._said.get(name) or self._said.get(f"detect/{short}", "")
         return f"{line}: {why}" if why else line
 
+    def of_camera(self, camera: str) -> str:
+        """Say what one camera's calibration lacks, and why; empty: nothing."""
+        return self.words((self._imu, f"camera/{camera}"))
+
     def told(self, estimate: CalibrationEstimate, camera: str) -> CalibrationEstimate:
         """Return an estimate as it is published for one camera, with the trouble of its input.
 
         What the status says of a calibration stands. While something is missing no motion is asked for, which
         would not be seen. A camera of which nothing is known waits, whatever is known of the others.
         """
-        missing = self.words((self._imu, f"camera/{camera}"))
+        missing = self.of_camera(camera)
         wrong = self._wrong_target.get(camera, "")
         if not missing and not wrong:
             return estimate

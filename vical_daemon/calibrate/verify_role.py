@@ -9,26 +9,29 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Container
 from contextlib import suppress
 
 import numpy as np
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.interface import Bus
+from vical_daemon.bus.interface import Bus, Sample
 from vical_daemon.bus.messages import (
     CheckState,
     DiagnosticStatus,
     Level,
     MessageError,
     VerifyResult,
+    decode_diagnostics,
     decode_string,
     encode_verification,
 )
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
-from vical_daemon.calibrate.estimators import input_keys
+from vical_daemon.calibrate.estimators import input_keys, status_keys
 from vical_daemon.calibrate.in_use import DevicesUnknownError, InUse, NothingInUseError, calibration_in_use
+from vical_daemon.calibrate.input_trouble import InputTrouble
 from vical_daemon.calibrate.motion import LISTEN_S, Motion
 from vical_daemon.calibrate.pause import Pause
 from vical_daemon.calibrate.persistence import CalibrationPersistence
@@ -67,10 +70,15 @@ class _VerifyService:
 
     def __init__(self, config: Config, bus: Bus, stop: threading.Event, clock: WallClock) -> None:
         self._config, self._bus, self._stop, self._clock = config, bus, stop, clock
+        self._imu = f"imu/{config.calibration_imu}"
+        self._cameras = [f"camera/{name}" for name in config.calibration_cameras]
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._persistence = CalibrationPersistence(config, bus, clock)
         self._commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
         self._status = StatusSender(config.rig, "estimate", bus, clock)
+        rates_hz = {name: config.cameras[name].rate_hz for name in config.calibration_cameras}
+        self._trouble = InputTrouble(config.calibration_imu, rates_hz, always=False)
+        self._devices = [bus.subscribe(key, depth=8) for key in status_keys(config.rig)]
         self._pause = Pause(config.verify.cpu_percent / 100.0)
         self._state, self._image_rate_hz = CheckState.RESTING, 0.0
         self._words: set[str] = set()
@@ -96,7 +104,8 @@ class _VerifyService:
 
     def close(self) -> None:
         """Stop listening."""
-        self._commands.close()
+        for subscription in (self._commands, *self._devices):
+            subscription.close()
         self._persistence.close(None)
         self._set(CheckState.RESTING)
         self._status.finish(self._statuses)
@@ -159,8 +168,9 @@ class _VerifyService:
         try:
             end_s = time.monotonic() + 2.0 * LISTEN_S
             while time.monotonic() < end_s and not motion.looked and not self._stop.is_set():
-                self._tick(queue.wait(_TICK_S))
+                self._tick(queue.wait(_TICK_S), listening=(self._imu,))
                 for sample in queue.take(_QUEUE_LIMIT):
+                    self._came(sample)
                     motion.take(sample, time.monotonic())
         finally:
             queue.close()
@@ -169,13 +179,22 @@ class _VerifyService:
     def _take(self, queue: SubscriberQueue, verification: Verification, motion: Motion) -> None:
         stretch = Stretch(self._imu_key, motion, time.monotonic(), verification.used_s)
         while not self._stop.is_set() and not self._interrupted:
-            self._tick(queue.wait(_TICK_S))
+            self._tick(queue.wait(_TICK_S), listening=(self._imu, *self._cameras))
             now_s = time.monotonic()
             for sample in queue.take(_QUEUE_LIMIT):
+                self._came(sample)
                 verification.take(sample)
                 stretch.take(sample, now_s)
             if verification.step() or stretch.over(now_s, verification.used_s):
                 return
+
+    def _came(self, sample: Sample) -> None:
+        """Note that a device delivers."""
+        parsed = topics.parse_key(sample.key)
+        if sample.key == self._imu_key:
+            self._trouble.imu_came(new=True)
+        elif parsed is not None and parsed.topic in (topics.POINTS, topics.TRACKS):
+            self._trouble.image_came(parsed.name, new=True)
 
     @property
     def _interrupted(self) -> bool:
@@ -235,8 +254,13 @@ class _VerifyService:
         if changed:
             self._publish(force=True)
 
-    def _tick(self, _woken: bool = True) -> None:
-        """Read commands and publish, once a second."""
+    def _tick(self, _woken: bool = True, *, listening: Container[str] = ()) -> None:
+        """Read commands and how devices are, and publish, once a second; `listening`: see `InputTrouble`."""
+        for subscription in self._devices:
+            while (sample := subscription.recv(0.0)) is not None:
+                with suppress(MessageError):
+                    self._trouble.take(decode_diagnostics(sample.payload))
+        self._trouble.look(time.monotonic(), listening)
         while (sample := self._commands.recv(0.0)) is not None:
             with suppress(MessageError):  # not a command
                 self._words.add(decode_string(sample.payload).strip())
@@ -255,7 +279,7 @@ class _VerifyService:
         if self._in_use is not None and self._state is not CheckState.CALIBRATING:
             events = [] if self._verification is None else self._verification.events()
             estimate = self._persistence.said(self._in_use.estimate, events)
-            each = dict.fromkeys(self._config.calibration_cameras, estimate)
+            each = {n: self._trouble.told(estimate, n) for n in self._config.calibration_cameras}
             publish(self._bus, calibration_messages(self._config, each))
             publish(self._bus, companion_messages(self._config, estimate))
 
@@ -267,9 +291,11 @@ class _VerifyService:
             return VerifyResult(
                 now_ns, camera, self._state, against=source, text=text, image_rate_hz=self._image_rate_hz
             )
+        lacking = self._trouble.of_camera(camera)
         if checks is None:
-            return VerifyResult(now_ns, camera, CheckState.UNABLE, against=source, text=self._unable)
-        answer = checks.answers[camera]
+            text = "; ".join(filter(None, (lacking, self._unable)))
+            return VerifyResult(now_ns, camera, CheckState.UNABLE, against=source, text=text)
+        answer, text = checks.answers[camera], line(checks, camera, source, age(now_ns, checks.answered_ns))
         return VerifyResult(
             now_ns,
             camera,
@@ -277,22 +303,26 @@ class _VerifyService:
             answer.verdict.replace(" ", "_"),
             checks.answered_ns,
             source,
-            line(checks, camera, source, age(now_ns, checks.answered_ns)),
+            f"{lacking}; {text}" if lacking else text,
             checks.probability(camera),
             checks.used_s,
             checks.checks,
             answer.changes,
-            checks.missing(camera),
+            () if lacking else checks.missing(camera),
             self._image_rate_hz,
         )
 
     def _statuses(self) -> list[DiagnosticStatus]:
         results = {name: self._result(name) for name in self._config.calibration_cameras}
+        silent = self._trouble.silent
         counters = {"mode": "verify", "state": str(self._state)}
         if self._verification is not None:
             counters |= self._verification.role.statuses()[0].values
-        mine = DiagnosticStatus(Level.OK, "estimate", f"verify: {self._state}", "", counters)
-        return [mine, *(status(name, result) for name, result in results.items())]
+        counters["silent"] = ", ".join(silent)
+        text = "; ".join(filter(None, (f"verify: {self._state}", self._trouble.words())))
+        mine = DiagnosticStatus(Level.WARN if silent else Level.OK, "estimate", text, "", counters)
+        lacks = {name: bool(self._trouble.of_camera(name)) for name in results}
+        return [mine, *(status(name, result, lacks=lacks[name]) for name, result in results.items())]
 
 
 def _verifiable(config: Config, estimate: CalibrationEstimate) -> bool:

@@ -38,9 +38,9 @@ def age(now_ns: int, then_ns: int) -> str:
     return f"{seconds / 3600:.0f} h ago"
 
 
-def status(name: str, result: VerifyResult) -> DiagnosticStatus:
-    """Return the component `verify/<camera>` of the role's status."""
-    bad = result.verdict == "changed" or result.state is CheckState.UNABLE
+def status(name: str, result: VerifyResult, *, lacks: bool) -> DiagnosticStatus:
+    """Return the component `verify/<camera>` of the role's status; `lacks`: a device is silent."""
+    bad = lacks or result.verdict == "changed" or result.state is CheckState.UNABLE
     values = {
         "verdict": result.verdict,
         "against": result.against,

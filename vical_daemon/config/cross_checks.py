@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
+from vical_daemon.estimation.geometry.camera_model import coefficients_error
 
 if TYPE_CHECKING:
     from vical_daemon.config.model import BusConfig, CameraConfig, Config
@@ -91,14 +91,6 @@ def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterat
         key, value = needed[what]
         if value is None:
             yield path, f"calibration.fix holds {what}, so {key} must be given here"
-
-
-def coefficients_error(model: str, values: Sequence[float]) -> str:
-    """Return the problem with the number of distortion coefficients, "" if none."""
-    names = COEFFICIENTS[model]
-    if len(values) == len(names):
-        return ""
-    return f"expected {len(names)} values ({' '.join(names)} of {model}), found {len(values)}"
 
 
 def rigid_error(matrix: Sequence[Sequence[float]]) -> str:

@@ -17,12 +17,12 @@ from typing import Annotated, Literal
 import numpy as np
 
 from vical_daemon.config import validation as schema
-from vical_daemon.config.cross_checks import coefficients_error, rigid_error
+from vical_daemon.config.cross_checks import rigid_error
 from vical_daemon.config.foreign_files import foreign_file
 from vical_daemon.config.model import Config, Focal, LensConfig, Matrix4, Sigma
 from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, Document, Value, read
 from vical_daemon.config.validation import Bound
-from vical_daemon.estimation.geometry.camera_model import RADTAN
+from vical_daemon.estimation.geometry.camera_model import RADTAN, coefficients_error
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,

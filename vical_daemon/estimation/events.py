@@ -45,6 +45,7 @@ class EventKind(StrEnum):
     ACCEL_LAG = "accel_lag"
     ACCEL_POSITIONS = "accel_positions"
     TARGET_SIZE = "target_size"
+    TARGET_RATIO = "target_ratio"
     TARGET_SHAPE = "target_shape"
     FIXED_LENS = "fixed_lens"
     ROLLING_SHUTTER = "rolling_shutter"
@@ -230,7 +231,8 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.TIMESHIFT_STEPPED: About(
         "The time shift jumped; everything else is kept. Value: new minus old.",
         "s",
-        "When images have agreed with the new time shift for 3 s; target-free for 2 s.",
+        "When images have agreed with the new time shift for 3 s; target-free for 2 s. Not within 4 of the "
+        "sigmas that the IMU's driver states of its stamps.",
     ),
     EventKind.LENS_STEPPED: About(
         "The lens changed at once: focus or zoom was turned, or focuses by itself. A lens that is not "
@@ -335,6 +337,12 @@ REFERENCE: dict[EventKind, About] = {
         "The target is larger (+) or smaller (-) than its file says; its size is estimated. Value: relative.",
         "1",
         "Once: during initialisation if it is far off, else at a probability above 99 %.",
+    ),
+    EventKind.TARGET_RATIO: About(
+        "The columns of the target are further apart (+) or closer together (-), compared with its rows, "
+        "than its file says; allowed for. Value: relative.",
+        "1",
+        "During initialisation, where they are by 2.4 % or more.",
     ),
     EventKind.TARGET_SHAPE: About(
         "The target is bent, or its print is distorted; its shape is estimated. Value: the most certain "

@@ -7,7 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, PLUMB_BOB, RADTAN
+from vical_daemon.estimation.geometry.camera_model import (
+    COEFFICIENTS,
+    PLUMB_BOB,
+    RADTAN,
+    check_model,
+    coefficients_error,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -51,7 +57,7 @@ class CameraPrior:
         resolution: width, height, px.
         intrinsics: fx fy cx cy, px; None: guessed from the resolution.
         distortion_model: radtan, plumb_bob or equidistant.
-        distortion: The model's coefficients; None: zeros.
+        distortion: The model's coefficients; None or none: zeros.
         T_imu_cam: (R_imu_cam (3,3), p_imu_cam (3,)) or None: nothing known, found from the data.
         timeshift_cam_imu_s: t_imu = t_cam + shift, s; None: nothing known, found from the data.
         readout_s: Rolling-shutter readout, first to last row (or column), s; 0: global shutter.
@@ -60,6 +66,9 @@ class CameraPrior:
         intrinsics_sigma: How well fx fy cx cy are known where they are held, px; None: exactly.
         distortion_sigma: Likewise the coefficients.
         term: The last coefficient is one more than the lens has that is reported, see `with_next_term`.
+
+    Raises:
+        ValueError: Unknown distortion model, or not as many coefficients or sigmas as it has.
     """
 
     resolution: tuple[int, int]
@@ -73,6 +82,13 @@ class CameraPrior:
     intrinsics_sigma: tuple[float, float, float, float] | None = None
     distortion_sigma: tuple[float, ...] | None = None
     term: bool = False
+
+    def __post_init__(self) -> None:
+        check_model(self.distortion_model)
+        for what in ("distortion", "distortion_sigma"):
+            values: tuple[float, ...] | None = getattr(self, what)
+            if values and (error := coefficients_error(self.distortion_model, values)):
+                raise ValueError(f"{what}: {error}")
 
     def start_intrinsics(self) -> FloatArray:
         """Focal lengths and centre, px: as given, or of a lens of 60 degrees across; fx fy cx cy, (4,)."""

@@ -303,6 +303,14 @@ def _target_size(event: Event) -> str:
     return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
 
 
+def _target_ratio(event: Event) -> str:
+    how = "further apart" if (event.value or 0.0) > 0 else "closer together"
+    return (
+        f"compared with its rows, the target's columns are {_size(event, 100.0, '%', '.0f')} {how} than "
+        "stated: measure both; allowed for from now on"
+    )
+
+
 def _accel_lag(event: Event) -> str:
     late = "behind" if (event.value or 0.0) > 0 else "ahead of"
     return f"the accelerometer is {_size(event, 1e3, 'ms', '.2f')} {late} the gyro: allowed for from now on"
@@ -452,6 +460,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         ),
     ),
     EventKind.TARGET_SIZE: ("", _target_size),
+    EventKind.TARGET_RATIO: ("", _target_ratio),
     EventKind.TARGET_SHAPE: (
         "",
         lambda e: (

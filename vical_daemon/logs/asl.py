@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from vical_daemon.logs.stamps import StampError, numbers
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
+_DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
@@ -185,7 +187,9 @@ class AslRecording(Recording):
             return encode_points(int(t_ns[i]), name, ids[part], uv[part], image_size=size)
 
         t_ns = self._even_images(kind, name, t_ns, build)
-        return _Source(self._stream(kind, name, path, t_ns), t_ns, build)
+        extent = np.percentile(uv, 99.0, axis=0) if len(uv) else np.zeros(2)  # a few may be wrong
+        stream = replace(self._stream(kind, name, path, t_ns), extent_px=(float(extent[0]), float(extent[1])))
+        return _Source(stream, t_ns, build)
 
     def _read_images(self, table: Path, stamps: list[str], files: list[Path], lost: list[str]) -> _Source:
         folder = table.parent
@@ -200,7 +204,8 @@ class AslRecording(Recording):
         try:
             column = column_ns(numbers(stamps), "", imu=False)
         except StampError as error:
-            raise RecordingError(f"{table}: the stamp {stamps[error.index]} is no number") from None
+            advice = "; write dates as nanoseconds since 1970" if _DATE.match(stamps[error.index]) else ""
+            raise RecordingError(f"{table}: the stamp {stamps[error.index]} is no number{advice}") from None
         self._note_stamps(folder.name, column.sigma_s, column.report)
         order = np.argsort(column.t_ns, kind="stable")
         t_ns = column.t_ns[order]
@@ -239,8 +244,10 @@ class AslRecording(Recording):
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
             column = column_ns(stamps, title, imu=dtype == _IMU_ROW)
         except StampError as error:
+            stamp = str(rows["t"][error.index]).strip()
+            advice = "; write dates as nanoseconds since 1970" if _DATE.match(stamp) else ""
             raise RecordingError(
-                f"{path}: row {error.index + 1} of the data: its stamp is no number"
+                f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp[:40]!r}{advice}"
             ) from None
         self._note_stamps(path.parent.name, column.sigma_s, column.report)
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":

@@ -12,7 +12,7 @@ from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline.accel_shift import AccelShift
-from vical_daemon.offline.errors import InputError, OptionError
+from vical_daemon.offline.errors import InputError, OptionError, size_unknown
 
 
 @dataclass(slots=True)
@@ -205,14 +205,13 @@ def _prior(name: str, stream: Stream, prior: CameraPrior | None, fix: Sequence[s
     prior = prior or CameraPrior(resolution=(0, 0))
     if prior.resolution == (0, 0):
         if stream.resolution is None:
-            raise OptionError(
-                f"{name}: the image size is neither in the recording nor in --initial; "
-                f"give a file with `{name}: {{resolution: [width, height]}}`"
-            )
+            raise OptionError(f"{name}: {size_unknown(stream)}")
         prior = replace(prior, resolution=stream.resolution)
     elif stream.resolution is not None and stream.resolution != prior.resolution:
         given_size, size = ("{} x {}".format(*r) for r in (prior.resolution, stream.resolution))
         raise InputError(f"{name}: the given lens is for images of {given_size}, the recording's are {size}")
+    if outside := _points_outside(stream.extent_px, prior.resolution):
+        raise InputError(f"{name}: {outside}")
     given = {
         "intrinsics": prior.intrinsics,
         "extrinsics": prior.T_imu_cam,
@@ -222,6 +221,15 @@ def _prior(name: str, stream: Stream, prior: CameraPrior | None, fix: Sequence[s
         if given[what] is None:
             raise OptionError(f"--fix {what}: --initial does not give it for {name}")
     return prior
+
+
+def _points_outside(extent_px: tuple[float, float], size: tuple[int, int]) -> str:
+    """Say that points lie outside of images of this size; empty: they do not."""
+    (u, v), (width, height) = extent_px, size
+    if u < width and v < height:
+        return ""
+    swapped = "; are width and height swapped?" if u < height and v < width else ": correct `resolution`"
+    return f"points lie at up to ({u:.0f}, {v:.0f}) px, outside of images of {width} x {height}{swapped}"
 
 
 def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoise) -> Config:

@@ -15,7 +15,14 @@ import pytest
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
-from vical_daemon.bus.messages import Level, decode_string, encode_calibration
+from vical_daemon.bus.messages import (
+    CheckState,
+    Level,
+    VerifyResult,
+    decode_string,
+    encode_calibration,
+    encode_verification,
+)
 from vical_daemon.config.model import Config, WebConfig
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance, Lack, Verb
@@ -433,3 +440,34 @@ def test_what_the_operator_needs_is_seen_without_scrolling(
     assert "images/s" in texts["imagefacts"] and "of the image covered" in texts["imagefacts"]
     assert "joint sigmas" in texts["storedsays"] and "lever arm x" in texts["storedrows"]
     assert drawn and turned
+
+
+def test_a_calibration_that_holds_asks_for_no_board(served, web_feed, browser):
+    """With `mode: verify`: `bring the board into the outline` stood below `The stored calibration holds.`"""
+    bus, rng = served.bus, np.random.default_rng(0)
+    for k in range(1, 40):
+        web_feed.publish_estimate(bus, web_feed.estimate(0.2 * k, rng))
+    for number in range(1, 30):
+        web_feed.publish_image(bus, number)
+
+    async def publish(verdict):
+        for number in itertools.count(30):
+            web_feed.publish_estimate(bus, web_feed.estimate(8.0 + 1e-3 * number, rng))
+            web_feed.publish_image(bus, number)
+            result = VerifyResult(1, "cam0", CheckState.RESTING, verdict[0], 1, text="store")
+            bus.publish(topics.VERIFY.key(web_feed.RIG, "cam0"), encode_verification(result))
+            await asyncio.sleep(0.05)
+
+    async def script(page):
+        verdict = ["cannot_tell"]
+        await page.open(served.address, 390, 844)
+        feed = asyncio.create_task(publish(verdict))
+        await page.wait("document.querySelector('#corners path.wanted') !== null")
+        verdict[0] = "holds"
+        await page.wait("document.getElementById('status').textContent === 'holds'")
+        await page.wait("document.querySelector('#corners path.wanted') === null")
+        green = await page.evaluate("document.querySelector('.say').classList.contains('converged')")
+        feed.cancel()
+        return green, page.errors
+
+    assert browser.drive(script) == (True, [])

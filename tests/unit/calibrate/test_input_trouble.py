@@ -11,6 +11,7 @@ from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
     decode_calibration,
+    decode_diagnostics,
     encode_diagnostics,
     encode_imu,
     encode_points,
@@ -153,3 +154,24 @@ def test_a_slow_camera_is_silent_after_five_of_its_intervals() -> None:
         trouble.look(float(now_s))
         trouble.imu_came(new=True)
     assert not trouble.silent
+
+
+def test_where_data_come_only_now_and_then_drivers_are_asked_and_other_devices_only_heard() -> None:
+    """In `mode: verify`: nobody listens between two checks."""
+    trouble = InputTrouble("imu0", {"cam0": 10.0, "cam1": 10.0}, always=False)
+
+    def say(name: str, age_s: str) -> None:
+        status = DiagnosticStatus(Level.OK, name, "", values={"data_age_s": age_s})
+        trouble.take(decode_diagnostics(encode_diagnostics(0, "camera", [status])))
+
+    for now_s in range(9):
+        say("camera/cam0", "inf")  # nothing yet
+        say("camera/cam1", "0.05")
+        trouble.look(float(now_s))
+    assert trouble.words() == "nothing from cam0 yet, after 8 s"  # no driver speaks of imu0: not known
+    for now_s in range(9, 16):
+        trouble.look(float(now_s), ["imu/imu0"])
+    assert set(trouble.silent) == {"imu/imu0", "camera/cam0", "camera/cam1"}  # the drivers are gone as well
+    trouble.imu_came(new=True)
+    say("camera/cam0", "0.05")
+    assert list(trouble.silent) == ["camera/cam1"]

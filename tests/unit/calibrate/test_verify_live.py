@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from dataclasses import replace
@@ -39,6 +40,7 @@ from vical_daemon.results.known import known_cameras
 from vical_daemon.results.store import CalibrationStore
 from vical_daemon.results.verifier import Answer
 from vical_daemon.service.wall_clock import private_clock
+from vical_daemon.web.state import WebState
 
 T0_NS = 1_800_000_000 * 10**9
 SIGMA = np.array([2e-4] * 3 + [2e-4] * 3 + [5e-5] + [0.2] * 4 + [1e-3] * 4)
@@ -327,6 +329,40 @@ def test_a_rig_at_rest_asks_for_no_images(run, live, rng):
     ]
     role_run.play(still, lambda: len(role_run.wanted) > 590 and role_run.results)
     assert not any(role_run.wanted) and role_run.results[-1].state is CheckState.RESTING
+
+
+def test_a_silent_device_is_named_wherever_people_look_and_the_answer_stays(run, live):
+    """It said that the store holds, or that the motion is not enough, with the camera unplugged."""
+    role_run = live(run)
+
+    def say(level, message, age_s):
+        values = {"data_age_s": str(age_s)}
+        payload = encode_diagnostics(
+            1, "camera", [DiagnosticStatus(level, "camera/cam0", message, "C1", values)]
+        )
+        role_run.bus.publish(topics.STATUS.key("rig0", "camera"), payload)
+
+    role_run.play([], lambda: role_run.results)  # it listens by now
+    say(Level.ERROR, "/dev/video0 does not exist", 12.0)
+    why, page, imu = "/dev/video0 does not exist", WebState("rig0"), topics.IMU.key("rig0", "imu0")
+    for topic, name in ((topics.STATUS, "estimate"), (topics.CALIBRATION, "cam0"), (topics.VERIFY, "cam0")):
+        role_run.bus.subscribe(topic.key("rig0", name), page.take)
+    readings = [x for x in stream(run) if x[1] == imu][:1500]  # the rig moves; no image comes
+    role_run.play(
+        readings, lambda: role_run.statuses and why in role_run.statuses["verify/cam0"].message, speed=1.0
+    )
+    result, told = role_run.results[-1], role_run.last.estimate
+    assert re.fullmatch(rf"nothing from cam0 for 1\d s: {why}; cannot tell yet .*", result.text)
+    assert not result.missing_motion
+    assert {role_run.statuses[name].level for name in ("estimate", "verify/cam0")} == {Level.WARN}
+    assert role_run.statuses["estimate"].values["silent"] == "camera/cam0"
+    assert told.status is Status.CONVERGED and why in told.reason
+    page.tick()
+    shown = page.full()["cameras"]["cam0"]
+    assert "cam0" in shown["fault"]["headline"] and why in shown["fault"]["message"]
+    say(Level.OK, "30.0 Hz, 0 lost", 0.01)
+    role_run.play(readings, lambda: role_run.statuses["estimate"].level is Level.OK, speed=1.0)
+    assert "nothing from" not in role_run.results[-1].text
 
 
 def test_a_file_that_cannot_be_used_is_named(live, messages):

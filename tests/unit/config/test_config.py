@@ -301,7 +301,7 @@ class TestInitial:
             ("cam0: {distorsion_coeffs: [1]}", "did you mean distortion_coeffs"),
             (
                 "cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}",
-                r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5",
+                r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5; the model with these is plumb_bob",
             ),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
             ("cam0: {camera_model: omni}", "is not pinhole"),

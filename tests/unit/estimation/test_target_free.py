@@ -322,3 +322,14 @@ def test_two_cameras_are_for_a_rig_of_them():
     priors = {name: CameraPrior((640, 480)) for name in ("a", "b")}
     with pytest.raises(ValueError, match="one camera"):
         TargetFreeCalibrator(CalibrationOptions(target_free=True), priors)
+
+
+@pytest.mark.parametrize(("seed", "shift_s"), [(4, -5.0), (6, 4.5)])
+def test_images_whose_content_is_seconds_older_or_newer_than_their_stamps_are_placed(seed, shift_s):
+    """Beyond 2 s: `too few features are followed`, `the rotations agree in size but not in direction`."""
+    subject = subject_for(run := simulated(seed, seconds=24.0, shift_s=shift_s), seed=seed)
+    record = feed(run, subject)
+    assert record.snapshots[-1].status in ("converged", "converging")
+    assert abs(record.snapshots[-1].error[6]) < 1e-3
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s

@@ -1,5 +1,7 @@
 """Boards that have not the size in their file: a page fitted to the paper, a slip in a file."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -12,15 +14,15 @@ from vical_daemon.estimation.init import velocity_gravity_init
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 
-def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset()):
-    """What is reported of a rig whose board is `size` times as large as in its file."""
-    rig = reference_rig(seed, timeshift_cam_imu_s=0.01)
+def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset(), **rig_changes):
+    """What is reported of a rig whose board is `size` times as large as in its file (shape (3,): x, y, z)."""
+    rig = reference_rig(seed, timeshift_cam_imu_s=0.01, **rig_changes)
     run = simulate(seed, seconds, rig=rig)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"} if lens_known else ()), estimate=estimate, imu_noise=imu_noise(run)
     )
     prior = camera_prior(run, seed, StartErrors(0.02, 5.0), exact_lens=lens_known)
-    subject = CalibratorSubject(options, prior, board_points() / size)
+    subject = CalibratorSubject(options, replace(prior, readout_s=0.0), board_points() / size)
     return feed(run, subject), subject.calibrator
 
 
@@ -79,3 +81,27 @@ def test_another_size_is_tried_only_where_the_one_in_the_file_does_not_fit(monke
     record, calibrator = calibrated(1, 1.0)
     assert record.events == []
     assert calibrator.filter.state.target_scale == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("seed", "columns", "lens_known"), [(1, 1.11, False), (2, 1.11, True), (3, 1.03, False), (4, 0.9, False)]
+)
+def test_columns_further_apart_than_stated_are_told_and_every_answer_is_right(seed, columns, lens_known):
+    """At 11 % there was no start: `the delay is not determined, turn to and fro`, whatever the motion."""
+    record, _ = calibrated(seed, np.array([columns, 1.0, 1.0]), lens_known=lens_known)
+    kinds = [event.kind for _, event in record.events]
+    (event,) = (event for _, event in record.events if event.kind is EventKind.TARGET_RATIO)
+    assert event.value == pytest.approx(columns - 1.0, abs=2e-3)
+    assert EventKind.ROLLING_COLUMNS not in kinds and EventKind.ROLLING_SHUTTER not in kinds
+    assert record.started_s() <= 6.0
+    assert EventKind.TARGET_SHAPE not in kinds
+    assert np.sqrt(np.diag(record.snapshots[-1].covariance))[:3].max() < 1.5e-3
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_a_rolling_shutter_is_not_taken_for_columns_further_apart(seed):
+    """Over 3 s it looks like 3 % of them (`spacing_ratio` alone)."""
+    record, _ = calibrated(seed, 1.0, seconds=6.0, readout_s=0.033)
+    assert [event.kind for _, event in record.events] == [EventKind.ROLLING_SHUTTER]

@@ -194,6 +194,17 @@ def test_a_stamp_that_is_no_number_is_named(tmp_path, write_asl):
         open_recording(folder)
 
 
+def test_dates_for_stamps_are_shown_with_what_to_write(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    title, *rows = path.read_text().splitlines()
+    dated = [f"2026-11-27T09:00:{k / 100:09.6f}Z{row[row.index(',') :]}" for k, row in enumerate(rows)]
+    path.write_text("\n".join([title, *dated]) + "\n")
+    shown = r"row 1 .* no number: '2026-11-27T09:00:00.000000Z'; write dates as nanoseconds since 1970$"
+    with pytest.raises(RecordingError, match=shown):
+        open_recording(folder)
+
+
 def _rewritten(folder, change, table="mav0/imu0/data.csv"):
     """Change the lines of a table; returns the folder."""
     path = folder / table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,11 @@ from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.cli import calibration_text
 from vical_daemon.config.priors import read_initial
 from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.logs import open_recording
+from vical_daemon.logs import Stream, open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
 from vical_daemon.offline.calibration_job import make_job, suspects
+from vical_daemon.offline.errors import InputError, size_unknown
 
 
 def test_all_that_was_announced_on_the_way_is_told_at_the_end(
@@ -120,3 +122,28 @@ def test_a_second_camera_that_hardly_sees_the_target_is_suspected(shortest: Path
     assert suspects(job).endswith("hardly sees the target: --camera NAME takes one of them alone")
     job.config = replace(job.config, target=None)  # without a target each camera is on its own
     assert "--camera" not in suspects(job)
+
+
+@pytest.mark.parametrize(
+    ("size", "says"),
+    [("[480, 640]", "are width and height swapped?"), ("[320, 240]", "correct `resolution`")],
+)
+def test_corners_that_lie_outside_of_the_stated_images_are_named(
+    shortest: Path, tmp_path: Path, size: str, says: str
+) -> None:
+    """A folder of corners has no image size of its own; a wrong one was taken, and the result `converged`."""
+    given = tmp_path / "initial.yaml"
+    width_height = re.compile(r"resolution: \[.*\]")
+    given.write_text(width_height.sub(f"resolution: {size}", (shortest / "initial.yaml").read_text()))
+    with pytest.raises(InputError, match=r"cam0: points lie at up to \(\d+, \d+\) px, outside") as error:
+        make_job(open_recording(shortest), read_initial(given), target=str(shortest / "target.yaml"))
+    assert str(error.value).endswith(says)
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"), [("points", "the image size is not in the recording"), ("compressed", "like H.264")]
+)
+def test_an_image_size_that_is_not_known_is_told_with_the_reason(kind: str, says: str) -> None:
+    """A bag of H.264 images: only the size was asked for, and with it no image was read."""
+    text = size_unknown(Stream("k", kind, "cam0", "", 9, 0, 1, 10.0, 0.1))
+    assert says in text and "`cam0: {resolution: [width, height]}`" in text

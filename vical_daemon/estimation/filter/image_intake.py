@@ -62,7 +62,8 @@ class _Stream:
     def follow(self, lead_s: float) -> None:
         """Follow the lead of an image that was taken, s."""
         self.lead_s += _FOLLOW * (lead_s - self.lead_s)
-        self.most_s = max(lead_s, self.most_s + _SINKS * (lead_s - self.most_s))
+        if lead_s > self.most_s - SEARCHED_S:  # else images wait for a busy detector
+            self.most_s = max(lead_s, self.most_s + _SINKS * (lead_s - self.most_s))
         self.last_s = lead_s
 
     def is_set(self, lead_s: float, newest_imu_s: float, imu_jump_s: float) -> bool:

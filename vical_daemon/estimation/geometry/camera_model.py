@@ -9,6 +9,8 @@ d = 4 or 5, whose leading axes broadcast, so that a filter projects all sigma po
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -31,6 +33,20 @@ def check_model(model: str) -> None:
     """Raise ValueError where there is no such distortion model."""
     if model not in COEFFICIENTS:
         raise ValueError(f"unknown distortion model {model!r}: use {' or '.join(COEFFICIENTS)}")
+
+
+def coefficients_error(model: str, values: Sequence[float]) -> str:
+    """Return the problem with the number of distortion coefficients, "" if none.
+
+    Raises:
+        ValueError: unknown model.
+    """
+    check_model(model)
+    names = COEFFICIENTS[model]
+    if len(values) == len(names):
+        return ""
+    five = f"; the model with these is {PLUMB_BOB}" if (model, len(values)) == (RADTAN, 5) else ""
+    return f"expected {len(names)} values ({' '.join(names)} of {model}), found {len(values)}{five}"
 
 
 def _front(z: FloatArray) -> FloatArray:

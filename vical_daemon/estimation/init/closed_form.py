@@ -26,6 +26,7 @@ from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.numbering import numbered_differently
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
+from vical_daemon.estimation.init.spacing_ratio import spacing_ratio, stretched
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
@@ -85,9 +86,9 @@ def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
     """
     seen: dict[str, Seen] = {}
     for name in data.priors:
-        found, axis = _seen(data, name)
-        if axis:
-            return StartResult(None, "", rolling=(name, axis))
+        found, axis, ratio = _seen(data, name)
+        if axis or ratio != 1.0:
+            return StartResult(None, "", rolling=(name, axis) if axis else None, ratio=ratio)
         seen[name] = found
     result = _complete(data, seen)
     if result.state is None and result.size is None and result.motion_missing and may_be_partial:
@@ -173,8 +174,11 @@ def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | N
     return (align_at(path, rows, shift_s, axes[0]), axes[0]) if len(axes) == 1 else (None, None)
 
 
-def _seen(data: StartData, name: str) -> tuple[Seen, str]:
-    """What a camera has seen, and which way a shutter rolls of which nothing was said; empty: it does not."""
+def _seen(data: StartData, name: str) -> tuple[Seen, str, float]:
+    """What a camera has seen, and what was not said: which way its shutter rolls, the target's `ratio`.
+
+    Empty: it does not roll. 1: columns and rows of the target are as stated.
+    """
     prior, given, target = data.priors[name], data.frames[name], data.target
     lens, readout_s = starting_camera(prior), prior.readout_s
     estimated = data.layout.cameras[name].readout is not None
@@ -183,14 +187,19 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
             lens.readout_axis = likely_axis(given, lens, target)
         readout_s = readout(given, lens, target, readout_s)
     free, look, axis = data.layout.lens_free(name), data.look and not (estimated or readout_s), ""
-    fit = lens_fit(given, lens, target, readout_s) if free or look else None
+    ratio = 1.0
+    fit = lens_fit(given, lens, target, readout_s) if free or data.look else None
+    if data.look and (ratio := spacing_ratio(given, lens, target, fit, readout_s)) != 1.0:
+        target = stretched(target, ratio)
+        fit = lens_fit(given, lens, target, readout_s)
     if fit is not None and look:
         axis = looks_rolling(given, lens, target, fit)
     if fit is not None and free:
         fit.take_into(lens)
     lens.readout_s = readout_s
     frames = at_middle_row(given, readout_s, lens.resolution, lens.readout_axis)
-    return Seen(lens, frames, [] if axis else usable_poses(frames, lens, target)), axis
+    poses = [] if axis or ratio != 1.0 else usable_poses(frames, lens, target)
+    return Seen(lens, frames, poses), axis, ratio
 
 
 def _starts(data: StartData, frames: Frames, lens: CameraState) -> bool:

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation.events import ROLLING, Event
+from vical_daemon.estimation.events import ROLLING, Event, EventKind
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
@@ -44,6 +44,7 @@ class Attempt:
         motion_missing: It is motion that is missing, not time.
         rolling: See `StartResult`.
         size: The target seems to be so many times as large as in its file, and is to be taken as that large.
+        ratio: See `StartResult`.
         half_turned: See `StartResult`, where the target looks the same then.
         news: What was found to be not as specified.
     """
@@ -54,6 +55,7 @@ class Attempt:
     motion_missing: bool = False
     rolling: tuple[str, str] | None = None
     size: float | None = None
+    ratio: float = 1.0
     half_turned: str = ""
     news: list[Event] = field(default_factory=list)
 
@@ -133,6 +135,9 @@ class Initializer:
                 may_resize=may_resize,
                 wait_s=0.0 if at_end else _WAIT_S,
             )
+            if found.ratio != 1.0:
+                rig.stretch(found.ratio)
+                news.append(Event(EventKind.TARGET_RATIO, value=rig.ratio - 1.0))
             if found.rolling is not None:  # its readout is one more unknown from now on
                 camera, axis = found.rolling
                 rig.estimate_readout(camera, axis)
@@ -143,7 +148,7 @@ class Initializer:
             elif found.half_turned:
                 camera = found.half_turned
                 self._frames[camera] = rig.turns.from_the_other_end(camera, self._frames[camera])
-            else:
+            elif found.ratio == 1.0:
                 break
         if found.filter is None and rig.size != size:
             rig.resize(size)
@@ -174,6 +179,8 @@ class Initializer:
         options = self._options
         if size != 1.0:
             options = replace(options, estimate=options.estimate | {model_selection.SIZE})
+        if rig.ratio != 1.0:  # by images of a few seconds; the rest is the first mode of its shape
+            options = replace(options, estimate=options.estimate | {model_selection.TARGET})
         options = replace(options, imu_noise=measured_noise(options.imu_noise, buffer.rows))
         frames, priors = {n: self._frames[n] for n in ready}, {n: rig.priors[n] for n in ready}
         data = start.StartData(
@@ -182,8 +189,8 @@ class Initializer:
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.half_turned and rig.turns.alike:
             return Attempt(reason=result.reason, half_turned=result.half_turned)
-        if result.rolling is not None:
-            return Attempt(rolling=result.rolling)
+        if result.rolling is not None or result.ratio != 1.0:
+            return Attempt(rolling=result.rolling, ratio=result.ratio)
         other = None if result.size is None else Attempt(size=size * result.size)
         if result.state is None:
             return other or _none(result.reason, result.motion_missing)

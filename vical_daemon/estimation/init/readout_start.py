@@ -71,6 +71,14 @@ def looks_rolling(frames: Frames, lens: CameraState, target: FloatArray, fit: Le
     return axis if surely else ""
 
 
+def most_of_a_readout(frames: Frames, lens: CameraState, target: FloatArray, fit: LensFit) -> float:
+    """What another readout, of rows or of columns, would take off the squared residuals, px^2.
+
+    Arguments as for `looks_rolling`.
+    """
+    return max(slope**2 / bend for slope, bend in _parabolas(frames, lens, target, fit, (ROWS, COLUMNS)))
+
+
 def lens_fit(frames: Frames, lens: CameraState, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
     """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few."""
     views = [frame for _, frame in at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis)]

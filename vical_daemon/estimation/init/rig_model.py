@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vical_daemon.estimation.init.half_turn import HalfTurns
+from vical_daemon.estimation.init.spacing_ratio import stretched
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import Layout, State, make_layout
@@ -26,6 +27,7 @@ class RigModel:
         priors: What is known about each camera.
         target: Points of the target as far as its size is known, m, shape (n, 3).
         size: Of the target over the stated one, where that is far off.
+        ratio: Likewise of the distance of its columns over that of its rows.
         layout: Where the errors live.
         silent: Cameras from which nothing comes now: they are not waited for.
         turns: Numbers the points of a target that looks the same upside down.
@@ -34,7 +36,8 @@ class RigModel:
     def __init__(
         self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray
     ) -> None:
-        self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
+        self.priors, self.target = dict(cameras), target_points_m
+        self.size = self.ratio = 1.0
         self.silent: frozenset[str] = frozenset()
         if "intrinsics" not in options.fix:
             self.priors = {name: prior.with_next_term() for name, prior in cameras.items()}
@@ -69,8 +72,13 @@ class RigModel:
 
     def resize(self, size: float) -> None:
         """The target is now taken to be `size` times as large as its file says."""
-        self.target, self.size = self._stated * size, size
+        self.target, self.size = stretched(self._stated, self.ratio) * size, size
         self.layout = self._lay_out()
+
+    def stretch(self, ratio: float) -> None:
+        """Its columns are now taken to be `ratio` times as far apart, compared with its rows, as till now."""
+        self.ratio *= ratio
+        self.resize(self.size)
 
     def start_from_lenses_of(self, state: State) -> None:
         """Take the lenses that were estimated as what is known about them."""

@@ -43,6 +43,8 @@ class StartResult:
             where a window does not fit with the stated one. None: it may be as in its file.
         rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
             the other (`ROWS`, `COLUMNS`); None: there is none.
+        ratio: Columns of the target seem to be so many times as far apart, compared with its rows, as stated;
+            1: as stated.
         half_turned: A camera by which the target is upside down against what it is by another; empty: none.
     """
 
@@ -54,6 +56,7 @@ class StartResult:
     poses: list[TargetPose] = field(default_factory=list)
     size: float | None = None
     rolling: tuple[str, str] | None = None
+    ratio: float = 1.0
     half_turned: str = ""
 
 

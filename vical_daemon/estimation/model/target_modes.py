@@ -17,7 +17,8 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 
 MODES = 11  # narrow, skew, and nine of second order, see `fields`
-_EXPECTED = 0.002  # of half the target's larger side
+EXPECTED = 0.002
+"""Of a mode, over half the target's larger side, one sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class TargetModes:
     @property
     def sigma_m(self) -> float:
         """Expected distance of a target's edges from where the file puts them, by mode, one sigma, m."""
-        return _EXPECTED * self.half_m
+        return EXPECTED * self.half_m
 
     def fields(self, points_m: FloatArray) -> FloatArray:
         """Displacements of points by each mode.

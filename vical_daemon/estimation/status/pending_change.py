@@ -103,11 +103,13 @@ class PendingChange:
     def news(self, f: CalibrationFilter) -> Event | None:
         """What is to be announced of a change that is confirmed, of filter `f`, and was not announced yet.
 
-        Nothing if all is as it was before, within what both leave open: images were wrong for a while.
+        Nothing if all is as it was before, within what both leave open: images were wrong for a while. Nor
+        if the IMU's stamps may have stepped instead: its driver says how well it knows them now.
         """
         now, before = Known.of(f)[self.camera], self.before[self.camera]
         step_s = now.timeshift_s - before.timeshift_s
-        open_s = LIKELY_SIGMAS * math.hypot(now.timeshift_sigma_s, before.timeshift_sigma_s)
+        sigmas_s = now.timeshift_sigma_s, before.timeshift_sigma_s, f.stamp_sigma_s
+        open_s = LIKELY_SIGMAS * math.hypot(*sigmas_s)
         if self.shift_stepped and abs(step_s) > max(open_s, IRRELEVANT_S):
             return Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s)
         step_px = now.intrinsics - before.intrinsics

@@ -17,7 +17,7 @@ from vical_daemon.estimation.temporal.camera_orientations import Orientations, t
 from vical_daemon.estimation.temporal.td_icp import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.logs import Recording, Stream
-from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
+from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore, size_unknown
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -139,10 +139,7 @@ def lens_of(stream: Stream, prior: CameraPrior | None) -> CameraState:
     """
     if prior is None:
         if stream.resolution is None:
-            raise OptionError(
-                f"{stream.name}: the image size is not in the recording; give --initial with "
-                f"`{stream.name}: {{resolution: [width, height]}}`"
-            )
+            raise OptionError(f"{stream.name}: {size_unknown(stream)}")
         prior = CameraPrior(resolution=stream.resolution)
     elif prior.resolution == (0, 0) and prior.intrinsics is None:
         if stream.resolution is None:

@@ -175,16 +175,14 @@ def _lens(info: CameraInfoMessage, name: str, source: str) -> tuple[str, tuple[f
         )
     if not any(distortion):
         model, distortion = model if model in COEFFICIENTS else "radtan", ()
-    elif model == "rational_polynomial" and not any(distortion[5:]):
+    elif model in ("plumb_bob", "radtan", "rational_polynomial") and not any(distortion[5:]):
         model = "plumb_bob" if any(distortion[4:]) else "radtan"
-    elif model == "plumb_bob" and not any(distortion[4:]):
-        model = "radtan"
     if model not in COEFFICIENTS:
         raise ExportError(
             f"{source}: distortion model {model!r} of {name} is none of {', '.join(COEFFICIENTS)}"
         )
     count = len(COEFFICIENTS[model])
-    if len(distortion) not in (0, *range(count, 9)):
+    if distortion and (len(distortion) < count or any(distortion[count:])):
         raise ExportError(
             f"{source}: {len(distortion)} distortion coefficients of {name}, {model} has {count}"
         )

@@ -148,6 +148,7 @@ _ACTIONABLE = {
     EventKind.IMU_CLIPPED,
     EventKind.ACCEL_LAG,
     EventKind.TARGET_SIZE,
+    EventKind.TARGET_RATIO,
     EventKind.TARGET_SHAPE,
     EventKind.ROLLING_SHUTTER,
     EventKind.CLOCK_DRIFT,

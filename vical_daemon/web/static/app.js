@@ -137,7 +137,7 @@ function drawWords() {
   $("status").className = `pill ${fault ? "fault" : status}`;
   document.querySelector("main").classList.toggle("stale", status === "stale");
   setText("status", fault ? "fault" : status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
-  document.querySelector(".say").classList.toggle("converged", status === "converged");
+  document.querySelector(".say").classList.toggle("converged", status === "converged" || status === "holds");
   document.querySelector(".say").classList.toggle("fault", Boolean(fault));
   const headline = latest ? latest.headline : "No estimate yet: the calibrate process is starting, or it does not run.";
   setText("headline", fault ? fault.headline : headline);
@@ -218,7 +218,7 @@ function keepSights(sights, full) { // a full message has the path, later ones t
 function drawSight() {
   const sight = page.sights[page.camera], latest = page.latest[page.camera];
   // No advice with a fault or old values, and none that contradicts "nothing is missing".
-  const quiet = faultOf(latest) || !latest || latest.stale || (latest.status === "converged" && !latest.guidance);
+  const quiet = faultOf(latest) || !latest || latest.stale || (["converged", "holds", "changed"].includes(latest.status) && !latest.guidance);
   camera.coverage = sight ? sight.coverage : null;
   camera.setWanted(sight && sight.wanted && !quiet ? sight.wanted : null);
   const fault = faultOf(latest), gone = Boolean(fault) && fault.name === `camera/${page.camera}`;

@@ -101,6 +101,15 @@ def test_images_that_wait_for_a_slow_detector_are_no_step_of_the_clock(seed):
     assert all(e.kind == "image_gap" for e in intake.news())
 
 
+def test_images_that_waited_for_half_a_minute_and_catch_up_are_no_step_of_the_clock():
+    """A busy computer after a replug: 7 s late for 20 s and more, then on time: `stepped by about +7.1 s`."""
+    t = 0.05 * np.arange(1200)
+    late_s = np.where((t > 15.0) & (t < 45.0), np.minimum(7.1, t - 15.0), 0.0)
+    intake = ImageIntake()
+    assert feed(intake, t, t + late_s) == list(t)
+    assert intake.news() == []
+
+
 def test_a_clock_that_is_set_while_images_wait_is_followed():
     t = 0.05 * np.arange(400)
     late = np.clip(0.5 * (t - 2.0), 0.0, 3.0)

@@ -59,3 +59,17 @@ def test_only_a_radtan_lens_gets_a_term(model):
     assert prior.term is (model == "radtan")
     assert len(prior.coefficients()) == {"radtan": 5, "plumb_bob": 5, "equidistant": 4}[model]
     assert prior.term or prior is given
+
+
+@pytest.mark.parametrize(
+    ("model", "change", "line"),
+    [
+        ("plumb_bob", {"distortion": (0.1,) * 4}, "distortion: expected 5 values .*, found 4$"),
+        ("radtan", {"distortion": (0.1,) * 5}, "distortion: expected 4 .* found 5; .* is plumb_bob"),
+        ("equidistant", {"distortion_sigma": (0.1,)}, "distortion_sigma: expected 4 values"),
+        ("omni", {}, "unknown distortion model 'omni'"),
+    ],
+)
+def test_a_lens_with_a_wrong_number_of_coefficients_is_refused_where_it_is_given(model, change, line):
+    with pytest.raises(ValueError, match=line):
+        CameraPrior((640, 480), distortion_model=model, **change)

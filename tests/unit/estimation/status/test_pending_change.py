@@ -59,3 +59,14 @@ def test_a_step_is_announced_if_it_exceeds_what_is_left_open(part, kind, step, s
         assert (event.kind, event.value) == (kind, pytest.approx(step))
     else:
         assert event is None
+
+
+@pytest.mark.parametrize(("stamps_s", "announced"), [(2e-3, False), (2e-4, True)])
+def test_a_step_within_what_the_driver_leaves_open_is_one_of_its_stamps(stamps_s, announced):
+    """After a replug the GX3's stamps were 2.7 ms off, known to 2 ms: `the time shift stepped by -2.6 ms`."""
+    f = some_filter()[0]
+    f.forget(f.layout.cameras["cam0"].timeshift, 4e-5)
+    change = PendingChange(Part.SHIFT, frozenset({Part.SHIFT}), "cam0", 0.0, Known.of(f))
+    f.state.cameras["cam0"].timeshift_s -= 2.6e-3
+    f.stamp_sigma_s = stamps_s
+    assert (change.news(f) is not None) is announced

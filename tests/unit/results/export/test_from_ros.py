@@ -130,6 +130,14 @@ def test_a_bag_of_ros_1(tmp_path):
     assert seen(read_known(str(tmp_path / "a.bag"))[0]["front"]) == expected()
 
 
+@pytest.mark.parametrize("stated", ["plumb_bob", "radtan", "rational_polynomial"])
+@pytest.mark.parametrize(("k3", "model", "count"), [(0.0, "radtan", 4), (0.02, "plumb_bob", 5)])
+def test_five_coefficients_are_those_of_the_model_that_has_them(tmp_path, stated, k3, model, count):
+    info = info_document(distortion_model=stated, d=[*D[:4], k3])
+    camera = read_known(write(tmp_path, tf_document(), info))[0]["cam_optical"]
+    assert (camera.model, camera.lens[4:].tolist()) == (model, [*D[:4], k3][:count])
+
+
 @pytest.mark.parametrize(
     ("documents", "line"),
     [
@@ -144,6 +152,14 @@ def test_a_bag_of_ros_1(tmp_path):
         ([tf_document(), info_document(k=[0.0] * 9)], "is not calibrated"),
         ([tf_document(), info_document(k=[1.0])], "camera matrix has 1 numbers"),
         ([tf_document(), info_document(distortion_model="cubic")], "distortion model 'cubic'"),
+        (
+            [tf_document(), info_document(distortion_model="equidistant", d=[0.1] * 5)],
+            "5 distortion coefficients of cam_optical, equidistant has 4",
+        ),
+        (
+            [tf_document(), info_document(d=[0.1] * 3)],
+            "3 distortion coefficients of cam_optical, radtan has 4",
+        ),
         ([tf_document(), {"k": K, "d": D}], "'width' is missing"),
         ([tf_document(), info_document(), {"imu_frame": "nose"}], "no transform of the IMU's frame 'nose'"),
     ],
