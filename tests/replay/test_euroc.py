@@ -75,7 +75,8 @@ def test_with_the_published_lens_it_reaches_kalibrs_result_and_says_that_the_len
         [(place - free_place)[:3], (free_mounting.inv() * mounting).as_rotvec(), [place[3] - free_place[3]]]
     )
     assert np.abs(away / np.hypot(sigma, free_sigma)).max() < 3.0
-    assert np.abs(away[3:6]).max() > np.deg2rad(0.3)
+    # 0.25 deg: far beyond what a free lens leaves open (0.36 deg with the accelerometer's axes in one place)
+    assert np.abs(away / free_sigma)[3:6].max() > 8.0
     # as large as what the lens does, or as a free lens leaves open, and no larger
     assert np.all(sigma < 2.0 * np.maximum(np.abs(away), free_sigma))
 

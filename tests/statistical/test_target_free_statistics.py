@@ -88,7 +88,7 @@ def with_blocks(seed):
             (np.array(estimate.imu.accel_matrix) - lower)[np.tril_indices(3)],
         ]
     )
-    entries = slice(carry.layout.core, carry.layout.dynamic - 1)  # and then the lag
+    entries = slice(carry.layout.gyro_matrix.start, carry.layout.accel_matrix.stop)
     P = carry.covariance()[entries, entries]
     return (
         nees(last.error, last.covariance, 7),
