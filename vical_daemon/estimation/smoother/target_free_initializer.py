@@ -44,8 +44,7 @@ class _Found(NamedTuple):
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
 
-_REACH_S, _FAR_S = 2.0, 6.0  # time shifts that are looked for at first, and after `_USUAL` attempts
-_USUAL = 3  # attempts: a shift of seconds is rare, and a wider search costs time and finds false ones
+_REACH_S = 2.0  # time shifts that are looked for, to both sides of what is given
 _SPAN_S = 5.0  # of images in the first attempt
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # likewise at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))  # of the mounting from rotations: a window converges from there
@@ -93,9 +92,9 @@ class TargetFreeInitializer:
             return None
         shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
         span = LONG_S if self.attempts.count > 1 else _SPAN_S
-        far = known is None and self.attempts.count >= _USUAL and self.attempts.count % 2 == 0
-        ahead_s = _FAR_S if far else max(shift, 0.0)  # inertial data may have to reach so far beyond
-        usable = _last_stretch(frames, end_s - ahead_s, buffer.oldest_s + 0.05 - min(shift, 0.0), span)
+        usable = _last_stretch(
+            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
+        )
         if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
             self.motion_missing = False
             return "collecting the first seconds: move the rig, keep textured things in view"
@@ -182,13 +181,11 @@ class TargetFreeInitializer:
         camera = starting_camera(prior)
         rows = buffer.rows
         shift_s = prior.timeshift_cam_imu_s or 0.0
-        most_s = _REACH_S if self.attempts.count <= _USUAL else _FAR_S
-        reach = (rows[:, 0] > frames[0][0] + shift_s - most_s) & (
-            rows[:, 0] < frames[-1][0] + shift_s + most_s
-        )
+        begin_s, end_s = frames[0][0] + shift_s - _REACH_S, frames[-1][0] + shift_s + _REACH_S
+        reach = (rows[:, 0] > begin_s) & (rows[:, 0] < end_s)
         t, gyro = rows[reach, 0], rows[reach, 1:4]
         given = prior.T_imu_cam if "extrinsics" in self.options.fix else None
-        inside = (t > frames[0][0]) & (t < frames[-1][0])
+        inside = (t > frames[0][0] + shift_s) & (t < frames[-1][0] + shift_s)
         one_axis = still_axis(t[inside], gyro[inside], np.zeros(3)) is not None
         if one_axis and given is None and frames[-1][0] - frames[0][0] < PARTIAL_S:
             return "the rig turns about one axis only so far: turn it about a second one"
