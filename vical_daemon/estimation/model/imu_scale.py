@@ -18,7 +18,7 @@ from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
 ENTRIES = 15  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
 APART = slice(ENTRIES, -1)  # m, positions of the accelerometer's axes; none without a start
-NUMBERS = ENTRIES + 6 + 1
+NUMBERS = ENTRIES + 6 + 1  # matrices, positions, lag
 # Positions of three axes whose mean is zero, by two vectors; orthonormal, so that no axis is special.
 _SPREAD = np.array([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]) / np.sqrt([2.0, 6.0])
 
