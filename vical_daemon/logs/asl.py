@@ -1,4 +1,7 @@
-"""Reads ASL/EuRoC folders: ``mav0/imu0/data.csv`` and ``mav0/cam0/`` with images, corners or tracks."""
+"""Reads ASL/EuRoC folders: ``mav0/imu0/data.csv`` and ``mav0/cam0/`` with images, corners or tracks.
+
+Folders of Kalibr's `kalibr_bagcreater` as well: ``imu0.csv`` next to ``cam0/``, images named by their stamps.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,7 @@ from vical_daemon.logs.asl_tables import (
     image_list,
     image_size,
     images_by_name,
+    imu_tables,
     load_table,
     read_table,
     without_cut_line,
@@ -99,10 +103,10 @@ class AslRecording(Recording):
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         self._sources: list[_Source] = []
-        for table in sorted(root.glob("imu*/data.csv")):
-            if names is not None and table.parent.name not in names:
-                continue
-            self._sources.append(self._read_imu(table))
+        imus = imu_tables(root)
+        for name, table in imus.items():
+            if names is None or name in names:
+                self._sources.append(self._read_imu(table, name))
         folders = sorted(path for path in root.glob("cam*") if path.is_dir())
         wanted = [path for path in folders if path.name in cameras] or folders
         for camera in wanted:
@@ -112,12 +116,13 @@ class AslRecording(Recording):
             if source is not None:
                 self._sources.append(source)
         self.streams = tuple(source.stream for source in self._sources)
-        if not self.streams and names is not None and list(root.glob("imu*/data.csv")):
+        if not self.streams and names is not None and imus:
             raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
         if not self.streams:
             raise RecordingError(
                 f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
-                "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz]"
+                "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz], or "
+                "Kalibr's imu0.csv and cam0/ with images named by their stamps, ns"
             )
 
     def imu_arrays(self, name: str) -> ImuArrays:
@@ -139,9 +144,8 @@ class AslRecording(Recording):
             source = sources[which]
             yield source.stream.key, source.build(i)
 
-    def _read_imu(self, path: Path) -> _Source:
-        name = path.parent.name
-        rows = self._load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+    def _read_imu(self, path: Path, name: str) -> _Source:
+        rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
         finite = np.isfinite(rows["values"]).all(axis=1)
         rows = self._even(rows[finite], name)
         if not finite.all():
@@ -167,10 +171,15 @@ class AslRecording(Recording):
         if path.is_file():
             return self._read_images(path, *image_list(path, folder))
         stamps, files = images_by_name(folder)
-        return self._read_images(path, stamps, files, []) if files else None
+        if len(stamps) < len(files):
+            self.warnings.append(
+                f"{folder.name}: {len(files)} images have no stamps: there is no data.csv, and names like "
+                f"{files[0].name} are no times in ns"
+            )
+        return self._read_images(path, stamps, files, []) if stamps else None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
-        rows = self._load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
+        rows = self._load(path, name, _POINT_ROW, "timestamp [ns], id, u and v columns")
         finite = np.isfinite(rows["uv"]).all(axis=1)
         if not finite.all():
             self.warnings.append(f"{name}: {int((~finite).sum())} points that are not finite left out")
@@ -225,14 +234,12 @@ class AslRecording(Recording):
             t_ns = self._even_images("compressed", folder.name, t_ns, build)
         return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
 
-    def _load(self, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+    def _load(self, path: Path, sensor: str, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
         whole = without_cut_line(text, columns_of(dtype))
         if len(whole) < len(text):
-            self.warnings.append(
-                f"{path.parent.name}: the last line of {path.name} is cut off; 1 line left out"
-            )
+            self.warnings.append(f"{sensor}: the last line of {path.name} is cut off; 1 line left out")
         title = text[: text.find(b"\n")].decode("utf-8", "replace")
         if dtype == _IMU_ROW and accelerometer_first(title):
             raise RecordingError(
@@ -249,7 +256,7 @@ class AslRecording(Recording):
             raise RecordingError(
                 f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp[:40]!r}{advice}"
             ) from None
-        self._note_stamps(path.parent.name, column.sigma_s, column.report)
+        self._note_stamps(sensor, column.sigma_s, column.report)
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
             _refuse_lost_digits(path, rows["t"], column.t_ns)
         out = np.empty(len(rows), dtype)

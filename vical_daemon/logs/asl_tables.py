@@ -191,14 +191,29 @@ def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[s
 
 
 def images_by_name(folder: Path) -> tuple[list[str], list[Path]]:
-    """Return stamps and files of a folder without ``data.csv`` whose images are named by their stamps.
+    """Return stamps and files of images without ``data.csv``; no stamps where they are not named by these.
 
-    Kalibr's `kalibr_bagcreater` reads such folders. Images that are merely numbered have no stamps.
+    Kalibr's `kalibr_bagcreater` reads such folders (ns); names like ``1305031102.175304`` are seconds. Images
+    that are merely numbered have no stamps.
     """
     places = [place for place in (folder / "data", folder) if place.is_dir()]
     images = [p for place in places for p in sorted(place.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES]
-    stamped = bool(images) and all(len(p.stem) >= _STAMP_DIGITS and p.stem.isdecimal() for p in images)
-    return ([p.stem for p in images], images) if stamped else ([], [])
+    stamped = bool(images) and all(_is_stamp(p.stem) for p in images)
+    return [p.stem for p in images] if stamped else [], images
+
+
+def _is_stamp(name: str) -> bool:
+    return len(name) >= _STAMP_DIGITS and re.fullmatch(r"[0-9]+(\.[0-9]+)?", name) is not None
+
+
+def imu_tables(root: Path) -> dict[str, Path]:
+    """Return the tables of inertial readings of a folder by the names of the IMUs, in order of these.
+
+    ``imu0/data.csv`` (ASL) or ``imu0.csv`` (Kalibr's `kalibr_bagcreater`; also ``imu.csv``).
+    """
+    found = {p.stem: p for p in root.glob("imu*.csv") if re.fullmatch(r"imu[0-9]*", p.stem)}
+    found |= {p.parent.name: p for p in root.glob("imu*/data.csv")}
+    return dict(sorted(found.items()))
 
 
 def image_size(folder: Path) -> tuple[int, int] | None:

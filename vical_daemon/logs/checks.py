@@ -45,7 +45,12 @@ def check_imu(name: str, samples: ImuArrays) -> list[str]:
 def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     many = min(_BURST, len(t_ns) - 1)
     step_ns = float(np.median(t_ns[many:] - t_ns[:-many])) / many
-    rate_hz = 1e9 / step_ns if step_ns > 0 else np.inf
+    if step_ns <= 0:
+        raise RecordingError(
+            f"{name}: most stamps are equal to others ({len(np.unique(t_ns))} different ones in {len(t_ns)} "
+            "samples); does the driver fill them, with nanoseconds?"
+        )
+    rate_hz = 1e9 / step_ns
     if rate_hz > _FASTEST_IMU_HZ:
         units = {1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
         near = min(units, key=lambda factor: abs(np.log(max(step_ns, 1e-3) * factor / 5e6)))

@@ -72,6 +72,10 @@ _PLAIN_WORDS = {
     "imu",
 }
 _RIG = "rig0"
+_UNDATED = (
+    "its messages have no stamps (header.stamp is 0); the times at which they were recorded are used, so the "
+    "delay until then is part of the time shift: fill header.stamp in the driver"
+)
 
 
 def name_of_topic(topic: str, kind: str) -> str:
@@ -99,6 +103,7 @@ class _Channel:
     name: str
     stamps: array[int] = field(default_factory=lambda: array("q"))
     marks: array[int] = field(default_factory=lambda: array("q"))  # of images, see `mark_of`
+    log_times: array[int] = field(default_factory=lambda: array("q"))  # of messages whose stamp is 0
     values: bytearray = field(default_factory=bytearray)
     resolution: tuple[int, int] | None = None
     unreadable: int = 0
@@ -132,6 +137,7 @@ class LogRecording(Recording):
         self._channels: dict[str, _Channel] = {}
         self._others: dict[str, str] = {}
         self._statuses: dict[str, str] = {}  # key of each topic with our status messages
+        self._undated: set[str] = set()  # topics whose messages are dated by their log times
         self._order = OutOfReach()
         self._scan()
         self._scanned = True
@@ -169,13 +175,26 @@ class LogRecording(Recording):
                 channel.values += raw.payload[_FORCE]
             else:
                 channel.marks.append(mark_of(raw.payload))
+            if stamp_ns == 0:
+                channel.log_times.append(raw.log_time_ns)
             channel.stamps.append(stamp_ns)
-            self._order.saw(stamp_ns, raw.log_time_ns)
-        for channel in self._channels.values():
+            self._order.saw(stamp_ns or raw.log_time_ns, raw.log_time_ns)
+        for topic, channel in self._channels.items():
+            if len(channel.log_times) > 1 and len(channel.log_times) == len(channel.stamps):
+                self._undated.add(topic)
+                channel.stamps = channel.log_times
+                self.warnings.append(f"{channel.name}: {_UNDATED}")
             if channel.unreadable:
                 why = f" ({channel.problem})" if channel.problem else ""
                 text = f"{channel.name}: {channel.unreadable} unreadable messages left out{why}"
                 self.warnings.append(text)
+
+    def _dated(self) -> Iterator[RawMessage]:
+        """Yield all messages; those of topics without stamps have their log times as stamps."""
+        for raw in self._raw():
+            if raw.topic in self._undated and stamp_of(raw.payload) is not None:
+                raw = raw._replace(payload=with_stamp(raw.payload, raw.log_time_ns))
+            yield raw
 
     def _meet(self, raw: RawMessage) -> _Channel | None:
         """Classify a topic by its first message."""
@@ -254,7 +273,7 @@ class LogRecording(Recording):
             topic, channel = min(of_it, key=lambda item: PREFERENCE.index(item[1].kind))
             stamps = CameraStamps(_stamps(channel), np.array(channel.marks, dtype=np.int64))
             wanted, reader = stamps.wanted, PointReader(channel.kind)
-            for raw in self._raw() if wanted else ():
+            for raw in self._dated() if wanted else ():
                 stamp_ns = stamp_of(raw.payload) if raw.topic == topic else None
                 if stamp_ns in wanted:
                     stamps.take(stamp_ns, reader.read(raw.payload))
@@ -289,7 +308,7 @@ class LogRecording(Recording):
         rows = dict.fromkeys(self._channels, 0)
         wanted = {topic: (c.key, c.kind == "imu") for topic, c in self._channels.items() if c.key in keys}
         wanted |= {topic: (key, False) for topic, key in self._statuses.items() if key in keys}
-        for raw in self._raw():
+        for raw in self._dated():
             if raw.topic not in wanted:
                 continue
             stamp_ns = stamp_of(raw.payload)

@@ -113,11 +113,9 @@ def make_job(
     imu_stream = _choose("imu", recording.imus, imu)
     chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
     if not chosen:
-        unread = "; ".join(w for w in recording.warnings if "unreadable" in w)
-        raise InputError(
-            f"{recording.path} holds no camera, neither images nor points{f' ({unread})' if unread else ''}; "
-            "`vical info` shows what is in it"
-        )
+        unread = "; ".join(w for w in recording.warnings if "unreadable" in w or "no stamps" in w)
+        why = f" ({unread})" if unread else "; `vical info` shows what is in it"
+        raise InputError(f"{recording.path} holds no camera, neither images nor points{why}")
     cameras = _cameras_meant(initial, chosen)
     priors = {name: _prior(name, stream, cameras.get(name), fix) for name, stream in chosen.items()}
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())

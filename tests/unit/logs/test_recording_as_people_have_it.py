@@ -15,9 +15,12 @@ from vical_mocks.points import simulate
 
 from vical_daemon.bus.messages import POINTS_TYPE
 from vical_daemon.bus.messages.schemas import DEFINITIONS
+from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
+from vical_daemon.offline.calibration_job import make_job
+from vical_daemon.offline.errors import InputError
 
 
 def test_files_of_another_camera_are_not_looked_at(tmp_path, write_asl):
@@ -334,3 +337,66 @@ def test_an_empty_name_is_not_the_present_folder(write_asl, tmp_path, monkeypatc
     monkeypatch.chdir(write_asl(tmp_path / "a"))
     with pytest.raises(RecordingError, match="the name of the recording is empty"):
         open_recording("")
+
+
+@pytest.mark.parametrize("undated", [("imu",), ("camera",), ("imu", "camera")])
+def test_messages_without_stamps_are_dated_by_the_log(tmp_path, write_asl, undated):
+    folder = open_recording(write_asl(tmp_path / "a"))
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for key, payload in folder.messages():
+            stamp_ns = stamp_of(payload)
+            writer.write(key, with_stamp(payload, 0) if key.split("/")[2] in undated else payload, stamp_ns)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert list(recording.messages()) == list(folder.messages())
+    assert sum("have no stamps (header.stamp is 0)" in w for w in recording.warnings) == len(undated)
+    assert recording.imu_arrays("imu0").t_ns.tolist() == folder.imu_arrays("imu0").t_ns.tolist()
+
+
+def test_a_simulation_may_begin_at_zero(tmp_path, write_asl):
+    folder = open_recording(write_asl(tmp_path / "a"))
+    begin_ns = min(stream.begin_ns for stream in folder.streams)
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for key, payload in folder.messages():
+            writer.write(key, with_stamp(payload, stamp_of(payload) - begin_ns), stamp_of(payload))
+    recording = open_recording(tmp_path / "a.mcap")
+    assert min(stream.begin_ns for stream in recording.streams) == 0
+    assert not any("no stamps" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("seconds", [False, True])
+def test_a_folder_of_kalibr_is_read(tmp_path, write_asl, a_motion, seconds):
+    """As `kalibr_bagcreater` takes it: imu0.csv next to cam0/, images named by their stamps."""
+    folder = write_asl(tmp_path / "a", corners=False)
+    whole = open_recording(folder, check=False)
+    (folder / "mav0/imu0/data.csv").rename(folder / "imu0.csv")
+    (folder / "mav0/imu0").rmdir()
+    images = folder / "cam0"
+    images.mkdir()
+    for t in a_motion()[0][::10].tolist():
+        name = f"{t // 10**9}.{t % 10**9:09d}" if seconds else str(t)
+        (images / f"{name}.png").write_bytes(b"image")
+    for part in sorted((folder / "mav0").rglob("*"), reverse=True):
+        part.rmdir()
+    (folder / "mav0").rmdir()
+    recording = open_recording(folder)
+    assert list(recording.imus) == ["imu0"]
+    assert recording.imu_arrays("imu0").gyro_rps.tobytes() == whole.imu_arrays("imu0").gyro_rps.tobytes()
+    assert recording.cameras["cam0"].rate_hz == pytest.approx(20.0)
+
+
+def test_images_that_are_only_numbered_are_named_as_that(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a", corners=False)
+    for number in range(5):
+        (folder / f"mav0/cam0/{number:06d}.png").write_bytes(b"image")
+    with pytest.raises(InputError, match=r"5 images have no stamps: .* names like 000000\.png"):
+        make_job(open_recording(folder), Initial(), target=None)
+
+
+def test_stamps_of_whole_seconds_are_named(tmp_path, write_asl):
+    """A driver that fills header.stamp.sec only."""
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for key, payload in open_recording(write_asl(tmp_path / "a")).messages():
+            stamp_ns = stamp_of(payload)
+            writer.write(key, with_stamp(payload, stamp_ns // 10**9 * 10**9), stamp_ns)
+    with pytest.raises(RecordingError, match=r"most stamps are equal to others \(12 different ones in 2400"):
+        open_recording(tmp_path / "a.mcap")
