@@ -23,6 +23,8 @@ what arrived meanwhile still waits in the queue."""
 _PERIODS = 5.0  # a slow camera is silent after so many intervals
 WRONG_TARGET = "wrong_target"
 """Value of a detector's status: what its images contradict in the target file, one line."""
+LOOKS_FOR = "looks_for"
+"""Likewise: the board that it found in none of many images, in words."""
 _NOTHING_YET = (Status.WAITING, Status.INITIALISING)
 
 
@@ -62,6 +64,7 @@ class InputTrouble:
             self._devices[f"camera/{name}"] = _Device(max(FRESH_S, _PERIODS / rate_hz))
         self._said: dict[str, str] = {}  # what is wrong with a device or its detector, by name
         self._wrong_target: dict[str, str] = {}  # what images contradict in the target file, by camera
+        self._looks_for: dict[str, str] = {}  # the board that was found in no image, by camera
         self._looked_s: float | None = None
 
     def imu_came(self, *, new: bool) -> None:
@@ -87,8 +90,11 @@ class InputTrouble:
             self._said[status.name] = status.message if bad else ""
             if not self._always:
                 self._of_driver(status)
+            role, _, name = status.name.partition("/")
             if WRONG_TARGET in status.values:
-                self._wrong_target[status.name.partition("/")[2]] = status.values[WRONG_TARGET]
+                self._wrong_target[name] = status.values[WRONG_TARGET]
+            if role == "detect":
+                self._looks_for[name] = status.values.get(LOOKS_FOR, "")
 
     def _of_driver(self, status: DiagnosticStatus) -> None:
         device = self._devices.get(status.name)
@@ -151,6 +157,10 @@ class InputTrouble:
         """
         missing = self.of_camera(camera)
         wrong = self._wrong_target.get(camera, "")
+        board = self._looks_for.get(camera, "") if estimate.status is Status.WAITING else ""
+        if board and not missing and not wrong:
+            text = f"{estimate.reason}; {camera} looks for {board}, as the target file says"
+            return replace(estimate, reason=text)
         if not missing and not wrong:
             return estimate
         if camera not in estimate.cameras and camera in self.cameras:

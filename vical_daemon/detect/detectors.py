@@ -56,3 +56,18 @@ def make_detector(config: Config, predictor: FlowPredictor | None, report: Calla
     assert config.target_path is not None  # checked by `config.load`
     target = load_target(config.target_path)
     return BoardDetector(target, check=TargetCheck(target, report)).detect
+
+
+def board_words(config: Config) -> str:
+    """Say which board is looked for; empty: natural features are followed, or the target file is gone."""
+    if config.calibration.mode == "target_free" or config.target_path is None:
+        return ""
+    from vical_daemon.vision.target import AprilGrid, TargetError, load_target
+
+    try:
+        target = load_target(config.target_path)
+    except TargetError:
+        return ""
+    if isinstance(target, AprilGrid):
+        return f"an AprilGrid with {target.tag_cols} x {target.tag_rows} tags"
+    return f"a checkerboard with {target.cols} x {target.rows} inner corners"

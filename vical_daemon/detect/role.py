@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.config.model import Config
 from vical_daemon.config.priors import camera_prior
-from vical_daemon.detect.detectors import Detect, make_detector
+from vical_daemon.detect.detectors import Detect, board_words, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
 from vical_daemon.detect.image_queue import ImageQueue
 from vical_daemon.detect.wanted import WantedImages
@@ -73,6 +74,7 @@ class DetectRole:
             detector or make_detector(config, predictor, self._on_wrong_target)
         )
         self.wrong_target = ""
+        self._looks_for = partial(board_words, config)
         self._detect = self._make()
         self._size = (prior or camera_prior(config, camera)).resolution
         self._other_size: tuple[int, int] | None = None  # of the last image, if not that
@@ -175,6 +177,9 @@ class DetectRole:
         if self._images > 50 and dropped > 0.1 * (self._images + dropped):
             level, ms = Level.WARN, 1e3 * self._busy_s / self._images
             message += f"; {dropped} were dropped: this computer is too slow for them ({ms:.0f} ms an image)"
+        if not self._found and level is Level.WARN and (board := self._looks_for()):
+            values["looks_for"] = board
+            message += f"; looked for: {board}"
         if self.wrong_target:
             level, message = Level.ERROR if share < 0.1 else Level.WARN, self.wrong_target
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)

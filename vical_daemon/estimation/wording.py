@@ -93,7 +93,7 @@ def guidance_caption(guidance: Guidance) -> str:
 
 
 _HEADLINES = {
-    "waiting": "Waiting for data.",
+    "waiting": "Not begun yet.",
     "initialising": "Looking for a first solution.",
     "converging": "The estimate is improving.",
     "converged": "Converged.",

@@ -134,6 +134,16 @@ def test_a_target_file_that_is_wrong_is_named_where_people_look(status: Status) 
     assert sent["cam1"].reason == ""
 
 
+def test_the_board_that_is_looked_for_is_named_where_none_was_found() -> None:
+    rig, board = Rig(), "a checkerboard with 9 x 6 inner corners"
+    rig.status = Status.WAITING
+    rig.say("detect/cam0", Level.WARN, "0% of 60 images show points", looks_for=board)
+    reason = rig.run(1.0)["cam0"].reason
+    assert reason.endswith(f"; cam0 looks for {board}, as the target file says")
+    rig.say("detect/cam0", Level.OK, "2% of 61 images show points")
+    assert "looks for" not in rig.run(1.0)["cam0"].reason
+
+
 def test_what_waits_in_the_queue_of_a_busy_estimator_is_not_missing() -> None:
     trouble = InputTrouble("imu0", {"cam0": 10.0})
     trouble.look(0.0)

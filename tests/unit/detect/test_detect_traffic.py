@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from vical_daemon.detect import role as detect
 from vical_daemon.detect import wanted
 from vical_daemon.detect.role import DetectRole
 from vical_daemon.service import notify
+from vical_daemon.vision.target import AprilGrid, Checkerboard
 
 MS = 1_000_000
 NOW = 1_800_000_000_000_000_000
@@ -79,6 +81,26 @@ class TestDetect:
         status = role.status()
         assert status.level is Level.ERROR and status.message.startswith("the tags stand in rows of 6")
         assert events == [("wrong_target", f"cam0: {status.message}")]
+
+    @pytest.mark.parametrize(
+        ("board", "words"),
+        [
+            (Checkerboard(9, 6, 0.05, 0.05), "a checkerboard with 9 x 6 inner corners"),
+            (AprilGrid(6, 5, 0.08, 0.3), "an AprilGrid with 6 x 5 tags"),
+        ],
+    )
+    def test_the_board_that_is_in_no_image_is_named(
+        self, config: Config, tmp_path: Path, board: Checkerboard | AprilGrid, words: str
+    ) -> None:
+        (tmp_path / "t.yaml").write_text(board.to_yaml())
+        role = DetectRole(replace(config, path=tmp_path / "vical.yaml"), "cam0")
+        for k in range(50):
+            role.points(image(NOW + k * 100 * MS))
+        assert "looks_for" not in role.status().values
+        role.points(image(NOW + 50 * 100 * MS))
+        status = role.status()
+        assert status.level is Level.WARN and status.values["looks_for"] == words
+        assert status.message == f"0% of 51 images show points; looked for: {words}"
 
     def test_a_computer_that_is_too_slow_is_named(self, config: Config) -> None:
         role = DetectRole(config, "cam0", lambda picture, t_ns: None)
