@@ -201,6 +201,9 @@ class LogRecording(Recording):
         kind = _KIND_OF_TYPE.get(raw.type_name)
         parsed = parse_key(raw.topic.removeprefix("/"))
         ours_but_not_measured = parsed is not None and parsed.topic is PREDICTED
+        if kind in ("image", "compressed") and raw.topic not in self._others and _shows_depth(raw):
+            self.warnings.append(f"{raw.topic}: images of depth, left out")
+            kind = None
         if kind is None or ours_but_not_measured or raw.topic in self._others:
             self._others[raw.topic] = raw.type_name
             if parsed is not None and parsed.topic is STATUS:
@@ -401,6 +404,20 @@ def _readable(channel: _Channel, payload: bytes) -> bool:
         channel.problem = channel.problem or str(error)
         return False
     return True
+
+
+def _shows_depth(raw: RawMessage) -> bool:
+    """Whether an image holds distances: `compressedDepth`, or 16UC1 or 32FC1 (REP 118) on such a topic.
+
+    Thermal cameras send 16UC1, too.
+    """
+    try:
+        if raw.type_name == COMPRESSED_IMAGE_TYPE:
+            return "compresseddepth" in decode_compressed_image(raw.payload).format.lower()
+        encoding = decode_image(raw.payload).encoding
+    except MessageError:
+        return False
+    return encoding in ("16UC1", "32FC1") and "depth" in raw.topic.lower()
 
 
 class McapRecording(LogRecording):

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from vical_mocks.harness.asl import write_asl as write_run
 from vical_mocks.points import simulate
 
-from vical_daemon.bus.messages import POINTS_TYPE
+from vical_daemon.bus.messages import POINTS_TYPE, encode_compressed_image, encode_image, encode_imu
 from vical_daemon.bus.messages.schemas import DEFINITIONS
 from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
@@ -400,3 +400,23 @@ def test_stamps_of_whole_seconds_are_named(tmp_path, write_asl):
             writer.write(key, with_stamp(payload, stamp_ns // 10**9 * 10**9), stamp_ns)
     with pytest.raises(RecordingError, match=r"most stamps are equal to others \(12 different ones in 2400"):
         open_recording(tmp_path / "a.mcap")
+
+
+def test_images_of_depth_are_no_camera(tmp_path, a_motion):
+    """A RealSense or a ZED: no board is ever seen in them."""
+    t_ns, gyro, force = a_motion(seconds=3.0)
+    gray, depth = np.zeros((6, 8), np.uint8), np.full((6, 8), 700, np.uint16)
+    flat = encode_image(0, "depth", depth, "16UC1").replace(b"16UC1", b"32FC1")
+    packed = encode_compressed_image(0, "depth", "16UC1; compressedDepth", bytes(12))
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for t, w, f in zip(t_ns.tolist(), gyro.tolist(), force.tolist(), strict=True):
+            writer.write("vical/rig0/imu/imu0", encode_imu(t, "imu0", w, f), t)
+        for t in t_ns[::10].tolist():
+            writer.write("vical/rig0/camera/color/image", encode_image(t, "color", gray, "mono8"), t)
+            writer.write("vical/rig0/camera/thermal/image", encode_image(t, "thermal", depth, "16UC1"), t)
+            writer.write("vical/rig0/camera/depth/image", encode_image(t, "depth", depth, "16UC1"), t)
+            writer.write("vical/rig0/camera/zed_depth/image", with_stamp(flat, t), t)
+            writer.write("vical/rig0/camera/packed/image/compressed", with_stamp(packed, t), t)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert sorted(recording.cameras) == ["color", "thermal"]
+    assert sum("images of depth, left out" in w for w in recording.warnings) == 3
