@@ -369,6 +369,9 @@ def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False
     status, last_status = STALE if stale else str(estimate.status), str(estimate.status)
     quiet = fault or stale
     asked = Guidance() if quiet else estimate.next_motion
+    # of the edges of another camera's picture only the text speaks
+    elsewhere = estimate.next_motion.camera not in ("", message.camera)
+    own = Guidance() if elsewhere else estimate.next_motion
     moves = asked.verb is Verb.TURN_AND_MOVE
     turns = asked.verb not in (Verb.NONE, Verb.SHOW)
     return {
@@ -376,7 +379,7 @@ def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False
         "last_status": last_status,
         "stale": stale,
         "age_s": round(age_s, 1),
-        "headline": silence(age_s) if stale else headline(status, estimate.next_motion),
+        "headline": silence(age_s) if stale else headline(status, own),
         "reason": f"The values are old; the last status was {last_status}." if stale else estimate.reason,
         "guidance": "" if quiet else estimate.guidance,
         "progress": finite(estimate.progress),
@@ -389,7 +392,7 @@ def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False
         "motion": {
             "rotate": list(asked.axes) if turns else [],
             "translate": list(asked.axes) if moves else [],
-            "edges": list(asked.edges),
+            "edges": [] if quiet else list(own.edges),
             "caption": "" if quiet else motion_caption(status, asked, estimate.guidance),
         },
         "gravity": [finite(v) for v in estimate.gravity_world_mps2],

@@ -261,6 +261,7 @@ def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
     async def script(page):
         await page.open(fed.address, 390, 844, dark=True)
         await page.wait("!document.getElementById('control').hidden")
+        await page.evaluate("document.getElementById('reason').textContent = '/folder'.repeat(40)")
         wide = await page.evaluate("document.documentElement.scrollWidth")
         await page.evaluate("document.getElementById('token').value = 'wrong'")
         await page.evaluate("document.querySelector('button[value=record_start]').click()")

@@ -200,6 +200,7 @@ def test_devices_and_metrics(bus, state, web_feed):
         (Guidance(Verb.TURN, ("x", "y"), Lack.ONE_AXIS, (0.0, 0.0, 1.0)), ["x", "y"], [], []),
         (Guidance(Verb.TURN_AND_MOVE, AXES), ["x", "y", "z"], ["x", "y", "z"], []),
         (Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left",)), [], [], ["left"]),
+        (Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam1", edges=("left",)), [], [], []),
     ],
 )
 def test_the_picture_shows_what_the_guidance_asks_for(bus, state, web_feed, asked, rotate, translate, edges):
@@ -232,6 +233,11 @@ def test_nothing_is_missing_is_said_only_where_nothing_is(bus, state, web_feed):
     entry = state.tick()["cameras"]["cam0"]
     assert entry["headline"] == "Converged, except near the edges of the image."
     assert "nothing" not in entry["motion"]["caption"] and "no corners" in entry["guidance"]
+    of_cam1 = Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam1", edges=("left",))
+    web_feed.publish_estimate(bus, web_feed.estimate(30.1, rng, Status.CONVERGED, motion=of_cam1))
+    entry = state.tick()["cameras"]["cam0"]
+    assert entry["headline"] == "Converged." and "cam1" in entry["guidance"]
+    assert "nothing" not in entry["motion"]["caption"]
     web_feed.publish_estimate(bus, web_feed.estimate(30.2, rng, Status.CONVERGED))
     entry = state.tick()["cameras"]["cam0"]
     assert (entry["headline"], entry["motion"]["caption"]) == ("Converged.", "nothing is missing")
