@@ -54,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     """Run one command; its exit code."""
+    plain_output.open_closed_streams()
     plain_output.accept_any_encoding()
     try:
         code = _dispatch(words)

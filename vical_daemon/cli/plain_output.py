@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import os
 import sys
 
 _READABLE = {"±": "+-", "°": " deg", "µ": "u", "×": "x", "→": "->", "…": "...", "·": "-", "–": "-", "—": "-"}
@@ -16,6 +17,20 @@ def readable(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     return "".join(_READABLE.get(c, "?") for c in error.object[error.start : error.end]), error.end
+
+
+def open_closed_streams() -> None:
+    """Point standard streams that are closed (``vical … >&-``) at nothing.
+
+    The next file that is opened would take their numbers, and libraries in C print into it.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+    sys.stdout = sys.stdout or os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", encoding="utf-8", closefd=False)
 
 
 def accept_any_encoding() -> None:

@@ -27,6 +27,13 @@ def vical(*words, cwd=None, **environment):
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&- <&-"])
+def test_closed_streams_are_no_error_and_no_file_takes_their_place(closed):
+    command = f'"{sys.executable}" -m vical_daemon completion bash {closed}'
+    done = subprocess.run(command, shell=True, capture_output=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_what_an_encoding_lacks_is_replaced(encoding):
     script = (
