@@ -98,9 +98,9 @@ class CameraInfoMessage:
     Attributes:
         stamp_ns: Stamp of the image or estimate it belongs to, UNIX ns.
         frame_id: Name of the camera.
-        width: Columns of the image.
-        height: Rows of the image.
-        intrinsics: fx fy cx cy, px.
+        width: Columns of the image, with binning and region of interest.
+        height: Rows of the image, likewise.
+        intrinsics: fx fy cx cy of that image, px.
         distortion_model: Our name: radtan (plumb_bob whose k3 is 0), plumb_bob or equidistant; ROS' name
             where we have none.
         distortion: Coefficients as sent (radtan: k1 k2 p1 p2 [0]).
@@ -221,6 +221,31 @@ def encode_camera_info(
     return writer.finish()
 
 
+def of_the_image(
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    binning: tuple[int, int],
+    part: tuple[int, int, int, int],
+) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
+    """Return size and intrinsics of the images that a sensor delivers with binning and a region of interest.
+
+    Size and matrix of a CameraInfo are those of the whole sensor without binning; the region is given in its
+    pixels. [sensor_msgs/CameraInfo; image_geometry/pinhole_camera_model.cpp]
+
+    Args:
+        size: width, height of the whole sensor, px.
+        intrinsics: fx fy cx cy of the whole sensor, px.
+        binning: Pixels that are joined, along x and y; 0: as 1.
+        part: x, y, width, height of the region of interest, px; a width or height of 0: the whole sensor.
+    """
+    x, y, width, height = part
+    if not width or not height:
+        x, y, (width, height) = 0, 0, size
+    by_x, by_y = max(binning[0], 1), max(binning[1], 1)
+    fx, fy, cx, cy = intrinsics
+    return (width // by_x, height // by_y), (fx / by_x, fy / by_y, (cx - x) / by_x, (cy - y) / by_y)
+
+
 def decode_camera_info(data: bytes) -> CameraInfoMessage:
     """Read a sensor_msgs/CameraInfo.
 
@@ -234,9 +259,12 @@ def decode_camera_info(data: bytes) -> CameraInfoMessage:
     distortion = tuple(float(value) for value in reader.sequence())
     k = reader.fixed(9)
     reader.skip(9 * 8 + 12 * 8, 8)  # rectification and projection
-    reader.skip(6 * 4 + 1, 4)  # binning and region of interest
+    binning_x, binning_y, x, y, part_height, part_width = (reader.scalar("I") for _ in range(6))
+    reader.skip(1, 1)
     reader.end()
-    intrinsics = (float(k[0]), float(k[4]), float(k[2]), float(k[5]))
+    full = (float(k[0]), float(k[4]), float(k[2]), float(k[5]))
+    part = (x, y, part_width, part_height)
+    (width, height), intrinsics = of_the_image((width, height), full, (binning_x, binning_y), part)
     model = _MODEL_FROM_ROS.get(model, model)
     if model == "plumb_bob" and not any(distortion[4:]):
         model = "radtan"

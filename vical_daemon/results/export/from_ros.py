@@ -8,12 +8,14 @@ no time shift: images and readings are taken to have the same clock, unless the 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vical_daemon.bus.messages import CameraInfoMessage, Transform
+from vical_daemon.bus.messages.image import of_the_image
 from vical_daemon.config.strict_yaml import ConfigError, parse
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
@@ -217,7 +219,12 @@ def _transform(entry: dict[str, Any]) -> Transform:
 def _of_camera_info(document: dict[str, Any]) -> CameraInfoMessage:
     k, d = ([float(x) for x in document[key if key in document else key.upper()]] for key in ("k", "d"))
     size = int(document["width"]), int(document["height"])
-    return _info(str(document["header"]["frame_id"]), size, k, str(document["distortion_model"]), d)
+    info = _info(str(document["header"]["frame_id"]), size, k, str(document["distortion_model"]), d)
+    roi = document.get("roi") or {}
+    binning = int(document.get("binning_x") or 0), int(document.get("binning_y") or 0)
+    x, y, width, height = (int(roi.get(key) or 0) for key in ("x_offset", "y_offset", "width", "height"))
+    (width, height), intrinsics = of_the_image(size, info.intrinsics, binning, (x, y, width, height))
+    return replace(info, width=width, height=height, intrinsics=intrinsics)
 
 
 def _of_camera_info_manager(document: dict[str, Any]) -> CameraInfoMessage:

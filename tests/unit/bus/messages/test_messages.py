@@ -186,6 +186,35 @@ def test_camera_info_with_a_fifth_coefficient_stays_plumb_bob():
     assert (decoded.distortion_model, decoded.distortion) == ("plumb_bob", d)
 
 
+@pytest.mark.parametrize(("binning", "part", "size", "lens"), [
+    ((0, 0), (0, 0, 0, 0), (1280, 960), (1000.0, 1002.0, 640.0, 480.0)),
+    ((1, 1), (0, 0, 1280, 960), (1280, 960), (1000.0, 1002.0, 640.0, 480.0)),
+    ((2, 2), (0, 0, 0, 0), (640, 480), (500.0, 501.0, 320.0, 240.0)),
+    ((1, 1), (320, 200, 640, 400), (640, 400), (1000.0, 1002.0, 320.0, 280.0)),
+    ((2, 1), (320, 200, 640, 400), (320, 400), (500.0, 1002.0, 160.0, 280.0)),
+])  # fmt: skip
+def test_binning_and_region_of_a_camera_info_are_applied(binning, part, size, lens):
+    """Size and matrix in the message are those of the whole sensor [sensor_msgs/CameraInfo]."""
+    x, y, width, height = part
+    roi = ros(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=x,
+        y_offset=y,
+        height=height,
+        width=width,
+        do_rectify=False,
+    )
+    k = np.array([1000.0, 0, 640.0, 0, 1002.0, 480.0, 0, 0, 1.0])
+    data = serialised(
+        ros(m.CAMERA_INFO_TYPE, header=header("cam0"), height=960, width=1280, distortion_model="plumb_bob",
+            d=np.zeros(5), k=k, r=np.eye(3).ravel(), p=np.zeros(12), roi=roi,
+            binning_x=binning[0], binning_y=binning[1]),
+        m.CAMERA_INFO_TYPE,
+    )  # fmt: skip
+    decoded = m.decode_camera_info(data)
+    assert ((decoded.width, decoded.height), decoded.intrinsics) == (size, lens)
+
+
 @pytest.mark.parametrize("type_name", [m.POINTS_TYPE, m.TRACKS_TYPE])
 @pytest.mark.parametrize("n", [0, 1, 144])
 @pytest.mark.parametrize("stated", [True, False])

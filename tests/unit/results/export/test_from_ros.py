@@ -130,6 +130,14 @@ def test_a_bag_of_ros_1(tmp_path):
     assert seen(read_known(str(tmp_path / "a.bag"))[0]["front"]) == expected()
 
 
+def test_binning_and_region_of_interest_are_applied(tmp_path):
+    roi = {"x_offset": 100, "y_offset": 40, "height": 400, "width": 600, "do_rectify": False}
+    info = info_document(binning_x=2, binning_y=2, roi=roi)
+    camera = read_known(write(tmp_path, tf_document(), info))[0]["cam_optical"]
+    assert camera.resolution == (300, 200)
+    assert camera.lens[:4].tolist() == pytest.approx([458.0 / 2, 457.3 / 2, 267.2 / 2, 208.4 / 2])
+
+
 @pytest.mark.parametrize("stated", ["plumb_bob", "radtan", "rational_polynomial"])
 @pytest.mark.parametrize(("k3", "model", "count"), [(0.0, "radtan", 4), (0.02, "plumb_bob", 5)])
 def test_five_coefficients_are_those_of_the_model_that_has_them(tmp_path, stated, k3, model, count):
