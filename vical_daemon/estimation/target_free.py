@@ -24,7 +24,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
@@ -478,10 +478,6 @@ class TargetFreeCalibrator:
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""
         return []
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """Return how the calibration developed."""
-        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
 
 def _full(window: Window) -> bool:

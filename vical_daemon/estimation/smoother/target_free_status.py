@@ -11,7 +11,6 @@ from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
-from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
@@ -63,7 +62,6 @@ class TargetFreeStatus(Evaluator):
         self._pixels: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
         self._sigma_px = self.jitter_s = 0.0
-        self._trace[self.camera] = Trace()
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling)
@@ -185,10 +183,6 @@ class TargetFreeStatus(Evaluator):
         self._pixels.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))
-        trace = self._trace[self.camera]
-        if trace.due(t_s):
-            imu = imu_estimate(fit.carry)
-            trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status, imu)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
