@@ -469,10 +469,8 @@ class TargetFreeCalibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
-        known = self.latest
-        if known is not None and self._buffer is not None:
-            known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
-        estimate = self.evaluator.estimate(known, running=self.window is not None, gravity=gravity)
+        known, newest_s = self.latest, -np.inf if self._buffer is None else self._buffer.newest_s
+        estimate = self.evaluator.estimate(known, newest_s, running=self.window is not None, gravity=gravity)
         return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
 
     def held_out(self) -> list[HeldOutCheck]:
