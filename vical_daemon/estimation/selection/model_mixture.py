@@ -230,10 +230,9 @@ def log_bayes_factors(
     """
     R = noise**2
     wider = less + (less - 1.0) * R
-    log_det, square = _of_submatrices(covariance + np.diag(R / wider), values, sizes)
-    if less != 1.0:
-        other_det, other = _of_submatrices(unit(len(R)) + (less - 1.0) * covariance, values, sizes)
-        log_det, square = log_det - other_det, square - (less - 1.0) * other
+    both = np.array([covariance + np.diag(R / wider), unit(len(R)) + (less - 1.0) * covariance])
+    (log_det, other_det), (square, other) = _of_submatrices(both, values, sizes)
+    log_det, square = log_det - other_det, square - (less - 1.0) * other
     sums = np.add.reduceat(np.log(wider / (1.0 + R)), np.cumsum([0, *sizes[:-1]]))
     return np.asarray(0.5 * (_subsets(len(sizes)) @ sums + log_det + square / less))
 
@@ -243,20 +242,29 @@ def _of_submatrices(A: FloatArray, x: FloatArray, sizes: Sequence[int]) -> tuple
 
     Block by block, by Schur complements: what two submatrices begin with is eliminated once.
 
+    Args:
+        A: Several matrices, shape (m, k, k).
+        x: Shape (k,).
+        sizes: Of the blocks.
+
+    Returns:
+        Both of shape (m, 2^blocks).
+
     Raises:
         numpy.linalg.LinAlgError: A is not positive definite.
     """
-    k = len(x)
-    left = np.zeros((1, k + 1, k + 1))
-    left[0, :k, :k], left[0, :k, k], left[0, k, :k] = A, x, x
-    logs = np.zeros(1)
+    m, k = A.shape[:2]
+    left = np.zeros((m, 1, k + 1, k + 1))
+    left[:, 0, :k, :k], left[:, 0, :k, k], left[:, 0, k, :k] = A, x, x
+    logs = np.zeros((m, 1))
     for n in sizes:
-        L = np.linalg.cholesky(left[:, :n, :n])
-        U = np.linalg.solve(L, left[:, :n, n:])
-        rest = left[:, n:, n:]
-        left = np.concatenate([rest, rest - U.swapaxes(1, 2) @ U])
-        logs = np.concatenate([logs, logs + 2.0 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)])
-    return logs, -left[:, 0, 0]
+        L = np.linalg.cholesky(left[:, :, :n, :n])
+        U = np.linalg.solve(L, left[:, :, :n, n:])
+        rest = left[:, :, n:, n:]
+        left = np.concatenate([rest, rest - U.swapaxes(2, 3) @ U], axis=1)
+        grown = 2.0 * np.log(np.diagonal(L, axis1=2, axis2=3)).sum(axis=2)
+        logs = np.concatenate([logs, logs + grown], axis=1)
+    return logs, -left[:, :, 0, 0]
 
 
 class _Conditioned(NamedTuple):

@@ -78,6 +78,23 @@ def test_the_evidence_is_the_prior_over_the_posterior_density_at_zero(factor):
     )
 
 
+@pytest.mark.parametrize("less", [1.0, 3.0])
+def test_hypotheses_that_share_their_work_are_weighed_as_if_each_were_alone(less):
+    rng = np.random.default_rng(4)
+    places, half = ([0, 1], [2, 3, 4], [5]), rng.standard_normal((6, 8)) / 3.0
+    values, covariance, noise = (
+        rng.standard_normal(6),
+        half @ half.T,
+        np.array([0.0, 0.0, 0.2, 0.0, 0.1, 0.0]),
+    )
+    found = log_bayes_factors(values, covariance, [2, 3, 1], less, noise)
+    assert len(found) == 8 and found[0] == 0.0
+    for number in range(1, 8):
+        at = [k for block, own in enumerate(places) if number >> block & 1 for k in own]
+        alone = log_bayes_factors(values[at], covariance[np.ix_(at, at)], [len(at)], less, noise[at])
+        assert found[number] == pytest.approx(alone[1], rel=1e-9)
+
+
 def test_nothing_learnt_is_no_evidence_however_long_errors_last():
     f, *_ = some_filter(factor=9.0)
     f.S = np.diag(np.full(f.layout.size, 1e-2))
