@@ -50,8 +50,8 @@ def reported_camera(camera: CameraState, onto: FloatArray) -> CameraState:
 
 def rounded(camera: CameraState) -> tuple[Numbers, Numbers, str, tuple[int, int]]:
     """Lens and image as the arguments of `lens_slopes`: rounded, they rarely have to be computed again."""
-    K = tuple(float(f"{x:.2g}") for x in camera.intrinsics.tolist())
-    D = tuple(round(x, 2) for x in camera.distortion.tolist())
+    K = tuple(float(f"{x:.3g}") for x in camera.intrinsics.tolist())
+    D = tuple(round(x, 3) for x in camera.distortion.tolist())
     return K, D, camera.distortion_model, camera.resolution
 
 

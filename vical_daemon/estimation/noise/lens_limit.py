@@ -22,7 +22,7 @@ def limit(camera: CameraState) -> FloatArray:
     """Standard deviations below which no lens is known: fx fy cx cy (px), distortion; shape (n,).
 
     Least squares of the lens to patches, eight by six over the image, that are each off by as much. It hardly
-    depends on the lens: rounded, it rarely has to be computed again.
+    depends on the lens: rounded to three digits, it rarely has to be computed again.
 
     A number that no patch shows gets 0: a lens that is far off may have rays for hardly any of them.
     """
