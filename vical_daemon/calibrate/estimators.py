@@ -10,7 +10,7 @@ from vical_daemon.bus import topics
 from vical_daemon.config.model import Config, ConfigError
 from vical_daemon.config.priors import calibration_options, camera_prior
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 
 
 class Estimator(Protocol):
@@ -61,10 +61,6 @@ class Estimator(Protocol):
 
     def estimate(self) -> CalibrationEstimate:
         """Return the current estimate, with the events since the last call."""
-        ...
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """Return the history of one camera's calibration."""
         ...
 
     def held_out(self) -> list[HeldOutCheck]:

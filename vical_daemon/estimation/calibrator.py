@@ -33,7 +33,7 @@ from vical_daemon.estimation.measurements import (
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.plausible import usable_points
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch, suspect
@@ -482,10 +482,6 @@ class Calibrator:
         self.evaluator.clocks_doubtful = self.watch.doubtful
         estimate = self.evaluator.estimate(self.filter, self._stale)
         return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """Return one entry a second of how a camera's calibration developed."""
-        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return how well the IMU alone predicted images before they were used, oldest first."""

@@ -108,28 +108,6 @@ class ImuEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class TracePoint:
-    """One entry a second of how a camera's calibration developed (`t_s` since the first sample).
-
-    Biases and their sigmas are those of `ImuEstimate`; [] where they were not kept.
-    """
-
-    t_s: float
-    p_m: list[float]
-    p_sigma_m: list[float]
-    q_wxyz: list[float]
-    r_sigma_rad: list[float]
-    timeshift_s: float
-    timeshift_sigma_s: float
-    nis_per_dof: float = 0.0
-    status: str = ""
-    gyro_bias_rps: list[float] = field(default_factory=list)
-    gyro_bias_sigma_rps: list[float] = field(default_factory=list)
-    accel_bias_mps2: list[float] = field(default_factory=list)
-    accel_bias_sigma_mps2: list[float] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True)
 class HeldOutCheck:
     """One image that the IMU alone predicted, some tenths of a second ahead, before it was used.
 

@@ -24,7 +24,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
@@ -469,19 +469,13 @@ class TargetFreeCalibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
-        known = self.latest
-        if known is not None and self._buffer is not None:
-            known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
-        estimate = self.evaluator.estimate(known, running=self.window is not None, gravity=gravity)
+        known, newest_s = self.latest, -np.inf if self._buffer is None else self._buffer.newest_s
+        estimate = self.evaluator.estimate(known, newest_s, running=self.window is not None, gravity=gravity)
         return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""
         return []
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """Return how the calibration developed."""
-        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
 
 def _full(window: Window) -> bool:

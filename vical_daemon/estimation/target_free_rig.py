@@ -16,7 +16,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, ImuEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, ImuEstimate, Status
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 # What the rig as a whole is: the first of these that any camera is.
@@ -113,10 +113,6 @@ class TargetFreeRig:
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""
         return []
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """Return how the calibration of one camera developed."""
-        return self.parts[camera].trace(camera) if camera in self.parts else []
 
 
 def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:

@@ -21,6 +21,7 @@ from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
 from vical_daemon.offline.accel_shift import STRAIGHT_S
 from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
+from vical_daemon.offline.trace import Trace
 
 if TYPE_CHECKING:
     from vical_daemon.detect.role import DetectRole
@@ -129,12 +130,13 @@ def run_job(
             part.accel_late += player.accel_late
         passes -= 1
     assert role.latest is not None
-    traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
     wrong = "; ".join(f"{d.camera}: {d.wrong_target}" for d in player.detectors if d.wrong_target)
     left_out = estimator.left_out | {"images_of_another_size": sum(d.refused for d in player.detectors)}
-    return Outcome(replace(role.latest, events=player.events), traces, frames, used, checks, left_out, wrong)
+    return Outcome(
+        replace(role.latest, events=player.events), player.trace.points, frames, used, checks, left_out, wrong
+    )
 
 
 class _Player:
@@ -150,6 +152,7 @@ class _Player:
         role: Estimates.
         estimator: Its estimator.
         events: What it announced so far.
+        trace: How its estimates developed.
         expected: About how many messages are played in all.
         may_shift: A long lag of the accelerometer ends the pass, to be taken off before the next.
         accel_late: By how many readings, then.
@@ -169,6 +172,7 @@ class _Player:
             job.config, self.estimator, PUBLISH_EVERY_S, inspect=self._inspect, keep=keep
         )
         self.events: list[Event] = []
+        self.trace = Trace(job.cameras)
         self.expected = 0.0
         self.may_shift, self.accel_late = False, 0
         self._stop, self._done, self._shown_s = False, 0, time.monotonic()
@@ -179,6 +183,7 @@ class _Player:
 
     def _inspect(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         self.events.extend(self._in_all(event) for event in estimate.events)
+        self.trace.take(estimate)
         self._stop = self._stop or (self._enough is not None and self._enough(estimate))
         return estimate
 

@@ -71,9 +71,6 @@ class Recorded:
             1, Status.WAITING, "", 0.0, "", 0.0, self.frames, self.imu_samples, {}, None, [], 0.0, 0.0
         )
 
-    def trace(self, camera: str) -> list[Any]:
-        return []
-
 
 def imu(t_ns: int, gyro: Any = (0.0, 0.0, 0.1), force: Any = (0.0, 0.0, 9.8)) -> Sample:
     return Sample(IMU, m.encode_imu(t_ns, "imu0", gyro, force), 0)

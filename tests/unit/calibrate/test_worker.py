@@ -33,7 +33,6 @@ from vical_daemon.estimation.result import (
     CameraEstimate,
     PoseEstimate,
     Status,
-    TracePoint,
 )
 
 MS = 1_000_000
@@ -84,9 +83,6 @@ class FakeEstimator:
         return CalibrationEstimate(
             newest, self.status, "", 0.5, "", 1.0, 2, 3, {"cam0": camera}, None, [0.0, 0.0, -9.8], 1.0, 0.0
         )
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        return []
 
 
 def _imu_message(t_ms: int) -> Sample:

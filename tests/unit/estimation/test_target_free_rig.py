@@ -82,8 +82,6 @@ def test_both_cameras_are_found_within_their_sigmas(pair, played):
         assert e @ np.linalg.solve(np.array(camera.T_imu_cam.covariance), e) < chi2.isf(1e-4, 6)
         late = camera.timeshift_cam_imu_s - run.rig.timeshift_cam_imu_s
         assert abs(late) < 4.0 * camera.timeshift_sigma_s
-    assert len(played[0].trace("left")) > 3
-    assert played[0].trace("other") == []
 
 
 def test_each_is_calibrated_as_if_it_were_alone(pair, played):

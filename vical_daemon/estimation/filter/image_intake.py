@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.imu_buffer import GAP_PERIODS
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, PointsFrame
-from vical_daemon.estimation.result import NEARLY, CalibrationEstimate, Status, TracePoint
+from vical_daemon.estimation.result import NEARLY, CalibrationEstimate, Status
 
 SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
@@ -232,11 +232,6 @@ def by_present_stamps(
         for name, e in estimate.cameras.items()
     }
     return replace(estimate, cameras=cameras)
-
-
-def trace_by_present_stamps(points: list[TracePoint], offset_s: float) -> list[TracePoint]:
-    """Return a trace likewise."""
-    return [replace(p, timeshift_s=p.timeshift_s + offset_s) for p in points]
 
 
 def _same(a: PointsFrame, b: PointsFrame) -> bool:

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vical_daemon.estimation.events import Event
-from vical_daemon.estimation.filter.image_intake import (
-    ImageIntake,
-    by_present_stamps,
-    trace_by_present_stamps,
-)
+from vical_daemon.estimation.filter.image_intake import ImageIntake, by_present_stamps
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake, Reading
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.plausible import stamp_sigma_problem
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate
 
 
 class SensorIntake:
@@ -117,7 +113,3 @@ class SensorIntake:
         """Return an estimate with time shifts by the stamps as they come now; `limit_s`: see there."""
         offsets = {name: self.offset_s(name) for name in estimate.cameras}
         return by_present_stamps(estimate, offsets, self.stamp_sigma_s, limit_s)
-
-    def trace_by_present_stamps(self, points: list[TracePoint], camera: str) -> list[TracePoint]:
-        """Return the trace of a camera likewise."""
-        return trace_by_present_stamps(points, self.offset_s(camera))

@@ -8,7 +8,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.next_term import onto_model, reported_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
-from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
+from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraState
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 
@@ -22,13 +22,14 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     (`lens_limit`).
     """
     where, held = f.layout.cameras[name], f.layout.held.get(name)
-    camera = reported_camera(f.state.cameras[name], _onto(f, name))
+    onto = _onto(f, name)
+    camera = reported_camera(f.state.cameras[name], onto)
     lens = np.concatenate([camera.intrinsics, camera.distortion]) if held is None else held.values
     spread = float(np.sqrt(f.consistency[name].factor))
-    lens_sigma = _lens_sigmas(f, name, spread)
+    lens_sigma = _lens_sigmas(f, name, spread, onto, camera)
     return camera_snapshot(
         camera,
-        joint=_calibration_covariance(f, name, spread, lens_sigma),
+        joint=_calibration_covariance(f, name, spread, lens_sigma, onto),
         lens=lens,
         lens_sigma=lens_sigma,
         readout_sigma_s=0.0 if where.readout is None else spread * float(f.sigmas()[where.readout]),
@@ -46,7 +47,7 @@ def _onto(f: CalibrationFilter, name: str) -> FloatArray:
 
 
 def _calibration_covariance(
-    f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray
+    f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray, onto: FloatArray
 ) -> FloatArray:
     """See `joint_covariance`; with what the filter holds because the motion does not show it.
 
@@ -54,7 +55,7 @@ def _calibration_covariance(
     model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose
     would be for another lens follows from its correlation with the pose.
     """
-    out = spread**2 * joint_covariance(f.S, f.layout.cameras[name], _onto(f, name))
+    out = spread**2 * joint_covariance(f.S, f.layout.cameras[name], onto)
     if f.layout.lens_free(name):
         lens = slice(7, None)
         out[lens, lens] += np.diag(np.maximum(lens_sigma**2 - np.diag(out)[lens], 0.0))
@@ -64,16 +65,17 @@ def _calibration_covariance(
     return out
 
 
-def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
+def _lens_sigmas(
+    f: CalibrationFilter, name: str, spread: float, onto: FloatArray, camera: CameraState
+) -> FloatArray:
     """Of fx fy cx cy and the distortion, shape (n,); where held: as far as images contradict the values."""
-    camera, where = f.state.cameras[name], f.layout.cameras[name]
+    where = f.layout.cameras[name]
     if where.intrinsics is None or where.distortion is None:
         return np.zeros(4 + len(camera.distortion))
-    onto = _onto(f, name)
     raw = np.linalg.norm(onto @ f.S[f.layout.lens(name)], axis=1)
     if name in f.layout.held:
         return f.layout.held[name].reported(spread * raw)
-    agreement, limit = f.agreement[name], lens_limit(reported_camera(camera, onto))
+    agreement, limit = f.agreement[name], lens_limit(camera)
     filtered = np.maximum(np.sqrt(agreement.factors), spread) * raw
     return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + limit**2))
 

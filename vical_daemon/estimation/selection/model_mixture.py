@@ -11,13 +11,15 @@ of the calibration for the lens as given; the covariance includes how far the mi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from functools import lru_cache
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import OFF
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
@@ -75,14 +77,37 @@ def hypotheses(S: FloatArray, every: Mapping[str, Block], less: float) -> Weight
     Args:
         S: Square root of the covariance, shape (n, m).
         every: The blocks that may be as specified.
-        less: As the factor of `log_bayes_factor`.
+        less: As the factor of `log_bayes_factors`.
     """
     if not every:
         return {(): 1.0}
-    rows = np.concatenate([S[b.where] / b.sigma[:, None] for b in every.values()])
-    values = {name: b.values / b.sigma for name, b in every.items()}
-    shares = {name: b.share for name, b in every.items() if b.stated.any()}
-    return posterior(values, rows @ rows.T, less, shares, {name: b.off for name, b in every.items()})
+    blocks = list(every.values())
+    sigma = np.concatenate([b.sigma for b in blocks])
+    values, noise = _of_all(blocks)
+    rows = np.concatenate([S[b.where] for b in blocks]) / sigma[:, None]
+    true, off = _subsets(len(blocks)), np.array([b.off for b in blocks])
+    logs = np.where(true, np.log(1.0 - off), np.log(off)).sum(axis=1)
+    sizes = [len(b.values) for b in blocks]
+    logs -= log_bayes_factors(values / sigma, rows @ rows.T, sizes, less, noise / sigma)
+    shares = np.exp(logs - logs.max())
+    return dict(zip(_named(tuple(every)), (shares / shares.sum()).tolist(), strict=True))
+
+
+def _of_all(blocks: Collection[Block]) -> tuple[FloatArray, FloatArray]:
+    """Values and noise of blocks, one after the other, each of shape (k,)."""
+    return np.concatenate([b.values for b in blocks]), np.concatenate([b.noise for b in blocks])
+
+
+@lru_cache(maxsize=16)
+def _subsets(count: int) -> BoolArray:
+    """Which blocks are as specified in each hypothesis: block i where bit i of its number is set."""
+    return np.asarray((np.arange(2**count)[:, None] >> np.arange(count)) & 1 == 1)
+
+
+@lru_cache(maxsize=16)
+def _named(names: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """The same by name."""
+    return [tuple(compress(names, row)) for row in _subsets(len(names))]
 
 
 def not_zero(shares: Weights, name: str) -> float:
@@ -111,35 +136,39 @@ def mixture(
     """
     if not every:
         return np.zeros(len(S)), S
-    held = [name for name, block in every.items() if block.held]
-    zeros = _Zeros.of(S, every)
-    ways, shifts, reported, shares, surely = [], [], [], [], set(every)
-    for true, p in weights.items():
-        if p < _NEGLIGIBLE:
-            continue
-        surely &= set(true)
-        U, shift = zeros.given(true)
-        ways.append(U)
-        shifts.append(shift)
-        if held:
-            reported.append(zeros.given({*true, *held}, exactly=held)[1])
-        shares.append(p)
-    share, d = np.array(shares) / sum(shares), np.array(shifts) @ S.T
-    mean = share @ d
-    taken = [p * (2.0 * U - (U @ U.T) @ U) for p, U in zip(shares, ways, strict=True)]
-    M = sum(shares) * unit(ways[0].shape[1]) - np.concatenate(ways).T @ np.concatenate(taken)
-    mixed = S @ root(M + RIDGE * unit(len(M)))[: S.shape[1]]
-    for name in surely:
-        if not every[name].stated.any():
-            mixed[every[name].where] = 0.0
-    apart = (np.sqrt(share / factor)[:, None] * (d - mean)).T  # of the reported covariance
-    columns = np.concatenate([mixed, apart], axis=1)
-    if not held:
-        return -mean, columns
-    shown = share @ (np.array(reported) @ S.T)
+    # large blocks first, as long as few hypotheses differ; lenses that are held last
+    names = sorted(every, key=lambda name: (every[name].held, -len(every[name].values)))
+    order = {name: every[name] for name in names}
+    held = [name for name in names if every[name].held]
+    likely = {true: p for true, p in weights.items() if p >= _NEGLIGIBLE}
+    share = np.array(list(likely.values())) / sum(likely.values())
+    values, noise = _of_all(order.values())
+    Q, R = np.linalg.qr(np.concatenate([S[b.where] for b in order.values()]).T)
+    k = len(values)
+    rows = np.concatenate([R.T, np.diag(noise)[:, noise > 0.0]], axis=1)
+    found, end, as_given = _Conditioned.none(len(likely), rows.shape[1]), 0, None
+    for name, block in order.items():
+        if block.held and as_given is None:
+            exactly = np.where(np.arange(rows.shape[1]) < k, rows[end:], 0.0)
+            as_given = found.on(exactly, values[end:], [True] * len(likely)).of_each(k)[1]
+        at = slice(end, end + len(block.values))
+        found, end = found.on(rows[at], values[at], [name in true for true in likely]), at.stop
+    P, means = found.of_each(k)
+    mean = share @ means
+    apart = np.sqrt(share / factor)[:, None] * (means - mean)  # of the reported covariance
+    P = (np.sqrt(share)[:, None, None] * P).swapaxes(0, 1).reshape(k, -1)
+    columns = np.concatenate([P, apart.T], axis=1)
+    by = S @ Q
+    mixed = S + (by @ (root(columns @ columns.T + RIDGE * unit(k)) - unit(k))) @ Q.T
+    for name, block in order.items():
+        if all(name in true for true in likely) and not block.stated.any():
+            mixed[block.where] = 0.0
+    if as_given is None:
+        return by @ mean, mixed
+    shown = by @ (share @ as_given)
     for name in held:
-        shown[every[name].where] = every[name].values
-    return -shown, joined(columns, shown - mean, factor)
+        shown[every[name].where] = -every[name].values
+    return shown, joined(mixed, by @ mean - shown, factor)
 
 
 def joined(S: FloatArray, apart: FloatArray, factor: float) -> FloatArray:
@@ -179,123 +208,104 @@ def term_block(camera: str) -> str:
     return f"lens term of {camera}"
 
 
-def log_bayes_factor(
-    values: FloatArray, covariance: FloatArray, factor: float, share: FloatArray | None = None
-) -> float:
-    """Logarithm of how much more likely the data are if the values are not zero.
+def log_bayes_factors(
+    values: FloatArray, covariance: FloatArray, sizes: Sequence[int], less: float, noise: FloatArray
+) -> FloatArray:
+    """Logarithm of how much more likely the data are without each hypothesis, in the order of `_subsets`.
+
+    With C the covariance of the blocks of a hypothesis and x their values, the information beyond the prior,
+    C^-1 - 1, is divided by f, which makes the covariance f C (1 + (f - 1) C)^-1 and the mean
+    (1 + (f - 1) C)^-1 x. The density of a measurement of zero with noise R under the prior, over that under
+    this posterior, follows from the submatrices C + R / (f + (f - 1) R) and 1 + (f - 1) C of two matrices.
 
     Args:
-        values: As estimated, over the sigmas of their prior, shape (n,).
-        covariance: Of them, shape (n, n).
-        factor: What was learnt beyond the prior is worth so many times less than the covariance says.
-        share: Not zero, but as near to it as that share of the prior's sigma, shape (n,); None: zero.
+        values: Of all blocks as estimated, over the sigmas of their prior, shape (k,).
+        covariance: Of them, shape (k, k).
+        sizes: Of the blocks.
+        less: f: what was learnt beyond the prior is worth so many times less than the covariance says.
+        noise: Sigma of a measurement of zero that makes the prior what is stated, likewise, shape (k,).
+
+    Returns:
+        Shape (2^blocks,).
     """
-    L = root(covariance)
-    standard = fitted = solve_lower(L, values)
-    size = -np.log(L.diagonal()).sum() - 0.5 * len(values) * np.log(factor)
-    if factor != 1.0:
-        # with C = L L' and M M' = I + (factor - 1) L'L: I + (C^-1 - I) / factor = L^-T M M' L^-1 / factor
-        M = root(np.eye(len(values)) + (factor - 1.0) * (L.T @ L))
-        fitted, size = solve_lower(M, standard), size + np.log(M.diagonal()).sum()
-    off = 0.5 * float(fitted @ fitted) / factor - float(size)
-    if share is None or not share.any():
-        return off
-    inverse = solve_lower(L, np.diag(share))  # with the share of each value on its right
-    learnt = (inverse.T @ inverse - np.diag(share**2)) / factor
-    return off - _log_evidence(learnt, inverse.T @ standard / factor)
+    R = noise**2
+    wider = less + (less - 1.0) * R
+    both = np.array([covariance + np.diag(R / wider), unit(len(R)) + (less - 1.0) * covariance])
+    (log_det, other_det), (square, other) = _of_submatrices(both, values, sizes)
+    log_det, square = log_det - other_det, square - (less - 1.0) * other
+    sums = np.add.reduceat(np.log(wider / (1.0 + R)), np.cumsum([0, *sizes[:-1]]))
+    return np.asarray(0.5 * (_subsets(len(sizes)) @ sums + log_det + square / less))
 
 
-def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
-    """Logarithm of how likely data are under a prior of unit variance, over that under exact zeros."""
-    L = root(np.eye(len(weighted)) + learnt)
-    fitted = solve_lower(L, weighted)
-    return 0.5 * float(fitted @ fitted) - float(np.log(L.diagonal()).sum())
+def _of_submatrices(A: FloatArray, x: FloatArray, sizes: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Log det A and x' A^-1 x of all submatrices of some blocks, in the order of `_subsets`.
 
-
-def posterior(
-    values: dict[str, FloatArray],
-    covariance: FloatArray,
-    less: float,
-    shares: Mapping[str, FloatArray] | None = None,
-    off: Mapping[str, float] | None = None,
-) -> Weights:
-    """Probability of each hypothesis, named by the blocks that are zero.
+    Block by block, by Schur complements: what two submatrices begin with is eliminated once.
 
     Args:
-        values: Of each block, as estimated, over the sigma of its prior.
-        covariance: Of all of them, in order, shape (n, n).
-        less: As the factor of `log_bayes_factor`.
-        shares: As its `share`, of the blocks that have one.
-        off: As its `off`; None: each is zero in nineteen rigs of twenty.
+        A: Several matrices, shape (m, k, k).
+        x: Shape (k,).
+        sizes: Of the blocks.
+
+    Returns:
+        Both of shape (m, 2^blocks).
+
+    Raises:
+        numpy.linalg.LinAlgError: A is not positive definite.
     """
-    ends = np.cumsum([len(x) for x in values.values()])
-    places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
-    every = np.concatenate([np.zeros(0), *values.values()])
-    stated = [(shares or {}).get(name, np.zeros(len(x))) for name, x in values.items()]
-    share = np.concatenate(stated) if shares else None
-    logs, priors = {}, dict.fromkeys(values, OFF) | dict(off or {})
-    for true in (c for n in range(len(values) + 1) for c in combinations(values, n)):
-        logs[true] = sum(np.log(1.0 - p if name in true else p) for name, p in priors.items())
-        if true:
-            at = np.concatenate([places[name] for name in true])
-            near = None if share is None else share[at]
-            logs[true] -= log_bayes_factor(every[at], covariance[at[:, None], at], less, near)
-    most = max(logs.values())
-    total = sum(np.exp(x - most) for x in logs.values())
-    return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
+    m, k = A.shape[:2]
+    left = np.zeros((m, 1, k + 1, k + 1))
+    left[:, 0, :k, :k], left[:, 0, :k, k], left[:, 0, k, :k] = A, x, x
+    logs = np.zeros((m, 1))
+    for n in sizes:
+        L = np.linalg.cholesky(left[:, :, :n, :n])
+        U = np.linalg.solve(L, left[:, :, :n, n:])
+        rest = left[:, :, n:, n:]
+        left = np.concatenate([rest, rest - U.swapaxes(2, 3) @ U], axis=1)
+        grown = 2.0 * np.log(np.diagonal(L, axis1=2, axis2=3)).sum(axis=2)
+        logs = np.concatenate([logs, logs + grown], axis=1)
+    return logs, -left[:, :, 0, 0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Zeros:
-    """A Gaussian conditioned on blocks that are as specified.
+class _Conditioned(NamedTuple):
+    """Gaussians of u, at first N(0, 1), conditioned on blocks that are as specified: values + rows u = 0.
 
-    With E the rows of these blocks, R the noise with which they are said to be zero, L L' = E S S' E' + R and
-    U = L^-1 [E S, R^1/2], that takes [S 0] U' U [S 0]' off P and moves the mean by -d, d = [S 0] U' L^-1 x.
-    The covariance over all models is [S 0] M [S 0]', M = sum p (I - U' U)^2 = sum p (I - U' (2 I - U U') U).
-    Without the square, which changes nothing but rounding, M may have negative eigenvalues.
+    With E the rows of all blocks of the square root S and E' = Q R (QR), the rows of u are [R', noise], and
+    the state moves by S Q u: u has as many components as there are values and noises. Each Gaussian has the
+    covariance P P', P = 1 - U' U a projection. The sum of squares P P' cannot have negative eigenvalues.
 
     Attributes:
-        places: Of each block among the rows of all blocks.
-        noise: Of all blocks, shape (k,).
-        rows: [E S, R^1/2] of all blocks, and their values; of R^1/2 the columns that are not zero; shape
-            (k, m + q + 1).
-        own: E S S' E' of all blocks, shape (k, k).
-        columns: m.
+        gaussians: P and mean of each, shape (g, w, w + 1).
+        which: Gaussian of each hypothesis: those that agree so far share one.
     """
 
-    places: dict[str, IntArray]
-    noise: FloatArray
-    rows: FloatArray
-    own: FloatArray
-    columns: int
+    gaussians: FloatArray
+    which: list[int]
 
     @classmethod
-    def of(cls, S: FloatArray, every: Mapping[str, Block]) -> _Zeros:
-        """Prepare the blocks of a square root of a covariance, shape (n, m)."""
-        blocks = every.values()
-        E = np.concatenate([S[b.where] for b in blocks])
-        values = np.concatenate([b.values for b in blocks])
-        noise = np.concatenate([b.noise for b in blocks])
-        ends = np.cumsum([len(b.values) for b in blocks])
-        places = {
-            name: np.arange(end - len(b.values), end)
-            for (name, b), end in zip(every.items(), ends, strict=True)
-        }
-        R = np.diag(noise)[:, noise > 0.0]
-        return cls(places, noise, np.concatenate([E, R, values[:, None]], axis=1), E @ E.T, S.shape[1])
+    def none(cls, hypotheses: int, width: int) -> _Conditioned:
+        """Nothing is as specified yet."""
+        return cls(np.eye(width, width + 1)[None], [0] * hypotheses)
 
-    def given(self, true: Collection[str], exactly: Collection[str] = ()) -> tuple[FloatArray, FloatArray]:
-        """U, shape (j, m + q), and U' L^-1 x, shape (m,), where some blocks are as specified.
+    def of_each(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """P and mean of the first components in each hypothesis, shapes (h, k, w) and (h, k)."""
+        found = self.gaussians[self.which, :k]
+        return found[:, :, :-1], found[:, :, -1]
+
+    def on(self, rows: FloatArray, values: FloatArray, true: Sequence[bool]) -> _Conditioned:
+        """Condition on one block.
 
         Args:
-            true: These.
-            exactly: Those of them that are exactly zero, whatever their stated sigma.
+            rows: Of the block, shape (n, w).
+            values: Its values, shape (n,).
+            true: The hypotheses in which it is as specified.
         """
-        if not true:
-            return self.rows[:0, :-1], np.zeros(self.columns)
-        at = np.concatenate([self.places[name] for name in self.places if name in true])
-        noise = self.noise.copy()
-        for name in exactly:
-            noise[self.places[name]] = 0.0
-        U = solve_lower(root(self.own[at[:, None], at] + np.diag(noise[at] ** 2)), self.rows[at])
-        return U[:, :-1], U[:, : self.columns].T @ U[:, -1]
+        pairs = list(zip(true, self.which, strict=True))
+        places = {pair: place for place, pair in enumerate(sorted(set(pairs)))}  # without it first
+        still = self.gaussians[[which for now, which in places if not now]]
+        now = self.gaussians[[which for now, which in places if now]]
+        G = rows @ now
+        G[:, :, -1] += values
+        U = np.linalg.solve(np.linalg.cholesky(G[:, :, :-1] @ G[:, :, :-1].swapaxes(1, 2)), G)
+        now -= U[:, :, :-1].swapaxes(1, 2) @ U
+        return _Conditioned(np.concatenate([still, now]), [places[pair] for pair in pairs])

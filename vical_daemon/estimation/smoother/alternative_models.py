@@ -78,6 +78,8 @@ class AlternativeModels:
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
         self._asked: tuple[MarginalPrior, tuple[float, ...], list[Clock]] | None = None  # see `clocks`
+        self._weighed: tuple[MarginalPrior, tuple[object, ...], Weights] | None = None  # see `_weights`
+        self._reported: tuple[ReportedModels, tuple[object, ...]] | None = None  # see `weighed`
         self._announced_s: tuple[float, ...] = ()  # jumps that may be the drift that was announced
 
     def watch(self, carry: MarginalPrior, factor: float, compared: bool) -> list[Event]:
@@ -201,7 +203,16 @@ class AlternativeModels:
         return settled(carry, self.clocks(carry, factor))
 
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> ReportedModels:
-        """How likely each model is, for the report; arguments as for `watch`."""
+        """How likely each model is, for the report; the same object as long as nothing has changed.
+
+        Arguments as for `watch`.
+        """
+        given = factor, compared, self.stamp_sigma_s, self.drifting, self.rolling, frozenset(self._off)
+        if self._reported is None or self._reported[0].carry is not carry or self._reported[1] != given:
+            self._reported = self._models(carry, factor, compared), given
+        return self._reported[0]
+
+    def _models(self, carry: MarginalPrior, factor: float, compared: bool) -> ReportedModels:
         weights = self._weights(carry, factor)
         specified = max(weights, key=len)
         if not compared and weights[specified] < 0.5:
@@ -209,6 +220,7 @@ class AlternativeModels:
             weights = {true: 0.5 if true == specified else others * p for true, p in weights.items()}
         every = self._blocks(carry)
         return ReportedModels(
+            carry,
             factor,
             tuple(self.clocks(carry, factor)),
             every,
@@ -218,13 +230,16 @@ class AlternativeModels:
         )
 
     def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
-        """Probability of each hypothesis about the imu, named by what is as specified.
+        """Probability of each hypothesis about the imu, named by what is as specified; asked as `clocks` is.
 
         Where windows disagree although all is free, it is the images, and what they say about the imu is
         worth less by as much again.
         """
-        doubtful = {name: block for name, block in self._blocks(carry).items() if name not in self._off}
-        return hypotheses(carry.S, doubtful, factor**2)
+        given = factor, frozenset(self._off)
+        if self._weighed is None or self._weighed[0] is not carry or self._weighed[1] != given:
+            doubtful = {name: block for name, block in self._blocks(carry).items() if name not in self._off}
+            self._weighed = carry, given, hypotheses(carry.S, doubtful, factor**2)
+        return self._weighed[2]
 
     def _blocks(self, carry: MarginalPrior) -> dict[str, Block]:
         """What is estimated apart from the calibration, by its name in `CalibrationOptions.estimate`."""

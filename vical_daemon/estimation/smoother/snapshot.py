@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,13 +20,15 @@ from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, mixture
 from vical_daemon.estimation.smoother.clock_changes import Clock, over_clocks
-from vical_daemon.estimation.smoother.marginal_prior import BIASES, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import BIASES, MarginalPrior, later
 
 
-class ReportedModels(NamedTuple):
+@dataclass(frozen=True)
+class ReportedModels:
     """How what is carried is to be reported.
 
     Attributes:
+        carry: What is carried.
         factor: Measured variance over the stated one; multiplies the reported covariance.
         clocks: Hypotheses about the clocks; none: the drift is not estimated.
         every: What may be as specified: the imu, a fixed lens.
@@ -35,6 +37,7 @@ class ReportedModels(NamedTuple):
         rolling: The shutter is known to be a rolling one: its readout is reported.
     """
 
+    carry: MarginalPrior
     factor: float
     clocks: tuple[Clock, ...]
     every: Mapping[str, Block]
@@ -42,24 +45,52 @@ class ReportedModels(NamedTuple):
     gyro_frame: bool = False
     rolling: bool = True
 
+    @cached_property
+    def averaged(self) -> tuple[CameraState, FloatArray]:
+        """Camera, and root of the covariance over `factor`, over the models of imu, fixed lens and clock."""
+        layout = self.carry.layout
+        (name,) = layout.cameras
+        d, S = self._over_clocks()
+        every = {block: replace(b, values=b.values + d[b.where]) for block, b in self.every.items()}
+        step, S = mixture(S, every, self.weights, self.factor)
+        d = d + step
+        camera = moved_camera(self.carry.camera, layout.camera, d)
+        if self.gyro_frame:
+            gyro_matrix = matrices_of(self.carry.imu + d[layout.inertial])[0]
+            cameras, S = in_gyro_frame(layout, gyro_matrix, {name: camera}, S)
+            camera = cameras[name]
+        return camera, S
+
+    def _over_clocks(self) -> tuple[FloatArray, FloatArray]:
+        """What the mean moves by, shape (n,), and root of the covariance over its factor, over the clocks."""
+        n = self.carry.layout.size
+        if not self.clocks:
+            return np.zeros(n), self.carry.S[:n]
+        d, P = over_clocks(self.carry, self.clocks, self.factor)
+        scale = np.sqrt(np.maximum(np.diag(P), 1e-300))  # pixels and microseconds
+        values, vectors = np.linalg.eigh(P / np.outer(scale, scale) / self.factor)
+        return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
 
 def camera_estimate(
-    carry: MarginalPrior,
     models: ReportedModels,
     sigma_px: float,
     rms_px: float,
     held: FloatArray | None = None,
+    later_s: float = 0.0,
 ) -> CameraEstimate:
     """The camera as it is known.
 
     Args:
-        carry: What is known.
-        models: See there.
+        models: What is known, and how it is to be reported.
         sigma_px: Pixel noise.
         rms_px: RMS of the residuals.
         held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
+        later_s: So long after the images the time shift is reported, s: the drift has moved it.
     """
-    camera, S = _averaged(carry, models)
+    carry, (camera, S) = models.carry, models.averaged
+    camera = replace(camera, timeshift_s=camera.timeshift_s + later_s * camera.skew)
+    S = later(carry.layout, later_s) @ S
     (name,), where = carry.layout.cameras, carry.layout.camera
     fixed = carry.layout.held.get(name)
     n = 4 + len(camera.distortion)
@@ -83,33 +114,6 @@ def camera_estimate(
         rolling=models.rolling,
         model_fits=models.factor == 1.0,
     )
-
-
-def _averaged(carry: MarginalPrior, models: ReportedModels) -> tuple[CameraState, FloatArray]:
-    """Camera, and root of the covariance over `factor`, over the models of imu, fixed lens and clock."""
-    layout = carry.layout
-    (name,) = layout.cameras
-    d, S = _over_clocks(carry, models)
-    every = {name: replace(b, values=b.values + d[b.where]) for name, b in models.every.items()}
-    step, S = mixture(S, every, models.weights, models.factor)
-    d = d + step
-    camera = moved_camera(carry.camera, layout.camera, d)
-    if models.gyro_frame:
-        gyro_matrix = matrices_of(carry.imu + d[layout.inertial])[0]
-        cameras, S = in_gyro_frame(layout, gyro_matrix, {name: camera}, S)
-        camera = cameras[name]
-    return camera, S
-
-
-def _over_clocks(carry: MarginalPrior, models: ReportedModels) -> tuple[FloatArray, FloatArray]:
-    """What the mean moves by, shape (n,), and root of the covariance over its factor, over the clocks."""
-    n = carry.layout.size
-    if not models.clocks:
-        return np.zeros(n), carry.S[:n]
-    d, P = over_clocks(carry, models.clocks, models.factor)
-    scale = np.sqrt(np.maximum(np.diag(P), 1e-300))  # pixels and microseconds
-    values, vectors = np.linalg.eigh(P / np.outer(scale, scale) / models.factor)
-    return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def imu_estimate(carry: MarginalPrior, *, matrices: bool = False, positions: bool = False) -> ImuEstimate:

@@ -11,7 +11,6 @@ from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
-from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
@@ -63,7 +62,6 @@ class TargetFreeStatus(Evaluator):
         self._pixels: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
         self._sigma_px = self.jitter_s = 0.0
-        self._trace[self.camera] = Trace()
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling)
@@ -185,10 +183,6 @@ class TargetFreeStatus(Evaluator):
         self._pixels.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))
-        trace = self._trace[self.camera]
-        if trace.due(t_s):
-            imu = imu_estimate(fit.carry)
-            trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status, imu)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
@@ -264,14 +258,21 @@ class TargetFreeStatus(Evaluator):
 
     # ------------------------------------------------------------------ output
     def estimate(
-        self, carry: MarginalPrior | None, *, running: bool, gravity: list[float]
+        self, carry: MarginalPrior | None, newest_s: float, *, running: bool, gravity: list[float]
     ) -> CalibrationEstimate:
-        """Put everything together."""
+        """Put everything together.
+
+        Args:
+            carry: What is known; its images are older than the newest reading.
+            newest_s: Time of that, s.
+            running: Images are being used.
+            gravity: In the world, m/s^2, shape (3,); [] before it is known.
+        """
         cameras, missing, imu = {}, {}, None
         if carry is None:
             reported = self._published(self._before_start())
         else:
-            camera, at = self._camera(carry), (carry.camera.R_imu_cam, carry.bias[:3])
+            camera, at = self._camera(carry, newest_s), (carry.camera.R_imu_cam, carry.bias[:3])
             weak = self._weak(camera, *at)
             lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
             doubt = self.models.reason(carry, self.factor(), believed=self.believed)
@@ -292,11 +293,12 @@ class TargetFreeStatus(Evaluator):
             refused=refused / max(seen, 1),
         )
 
-    def _camera(self, carry: MarginalPrior) -> CameraEstimate:
+    def _camera(self, carry: MarginalPrior, newest_s: float = -np.inf) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._pixels), sum(n for _, n in self._pixels)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         models = self.models.weighed(carry, self._reported_factor(), bool(self._squares))
-        return camera_estimate(carry, models, self._sigma_px, rms_px, self.held)
+        later_s = max(newest_s - carry.camera.timeshift_s - carry.t_cam_s, 0.0)
+        return camera_estimate(models, self._sigma_px, rms_px, self.held, later_s)
 
     def _decide(
         self, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool

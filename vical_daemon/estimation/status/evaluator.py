@@ -12,7 +12,6 @@ import numpy as np
 from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
-from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.model.unscented import RIDGE
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
@@ -21,7 +20,6 @@ from vical_daemon.estimation.result import (
     CameraEstimate,
     ImuEstimate,
     Status,
-    TracePoint,
 )
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
@@ -75,7 +73,6 @@ class Evaluator:
         self.bumped = Cause.NONE
         self._size: deque[float] = deque(maxlen=400)
         self._squares: deque[tuple[float, int]] = deque(maxlen=squares)
-        self._trace: dict[str, Trace] = {}
         self._ever_converged = self.believed = False
 
     def saw_reading(self, t_ns: int, gyro: Sequence[float], accel: Sequence[float]) -> None:
@@ -119,10 +116,6 @@ class Evaluator:
         """Put events into the next estimate."""
         for event in events:
             self._events.add(event)
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """The development of one camera."""
-        return list(self._trace[camera].points) if camera in self._trace else []
 
     def nis_per_dof(self) -> float:
         """Consistency: mean of normalised squares per degree of freedom; 1 when consistent."""

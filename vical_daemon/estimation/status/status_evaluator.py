@@ -15,7 +15,6 @@ from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import OFF, SURE
-from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 from vical_daemon.estimation.significance import EVERY_S
@@ -138,7 +137,6 @@ class StatusEvaluator(Evaluator):
         square = self._residuals.setdefault(report.camera, deque(maxlen=400))
         good = report.residual_px[report.accepted].ravel()
         square.append((float(good @ good), len(good)))
-        self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
         if f.unobservable is not None:  # with guesses nothing can be said of what else may be off
             return
@@ -147,13 +145,6 @@ class StatusEvaluator(Evaluator):
         if shared.wander_px:
             event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
             self.announce(event, once=f"wander {report.camera}")
-
-    def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
-        trace = self._trace.setdefault(camera, Trace())
-        if trace.due(f.state.t_s):
-            known = self.weighed(f)
-            imu = imu_estimate(known, matrices=False)
-            trace.add(f.state.t_s, self._camera(camera, known), self.nis_per_dof(), self.status, imu)
 
     # ------------------------------------------------------------------ output
     def estimate(

@@ -138,7 +138,8 @@ def test_the_odds_of_a_stated_sigma_are_those_of_two_priors():
         multivariate_normal(np.zeros(9), H @ np.diag(s**2) @ H.T + 0.09 * np.eye(9)).logpdf(z)
         for s in (np.ones(4), share)
     ]
-    found = model_mixture.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
+    noise = share / np.sqrt(1.0 - share**2)
+    found = model_mixture.log_bayes_factors(P @ H.T @ z / 0.09, P, [4], 1.0, noise)[1]
     assert found == pytest.approx(by_priors[0] - by_priors[1], abs=1e-6)
 
 

@@ -13,7 +13,7 @@ from tests.unit.estimation.some_filter import NAME, imu_entries, off, some_filte
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA, SURE
-from vical_daemon.estimation.selection.model_mixture import log_bayes_factor
+from vical_daemon.estimation.selection.model_mixture import log_bayes_factors
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
     LAG,
@@ -73,7 +73,26 @@ def test_the_evidence_is_the_prior_over_the_posterior_density_at_zero(factor):
     expected = multivariate_normal.logpdf(zero, zero, ENTRY_SIGMA**2 * np.eye(15))
     expected -= multivariate_normal.logpdf(zero, mean, tempered)
     covariance = P[np.ix_(entries, entries)] / ENTRY_SIGMA**2
-    assert log_bayes_factor(x[entries] / ENTRY_SIGMA, covariance, factor) == pytest.approx(expected, rel=1e-9)
+    assert log_bayes_factors(x[entries] / ENTRY_SIGMA, covariance, [15], factor, zero)[1] == pytest.approx(
+        expected, rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("less", [1.0, 3.0])
+def test_hypotheses_that_share_their_work_are_weighed_as_if_each_were_alone(less):
+    rng = np.random.default_rng(4)
+    places, half = ([0, 1], [2, 3, 4], [5]), rng.standard_normal((6, 8)) / 3.0
+    values, covariance, noise = (
+        rng.standard_normal(6),
+        half @ half.T,
+        np.array([0.0, 0.0, 0.2, 0.0, 0.1, 0.0]),
+    )
+    found = log_bayes_factors(values, covariance, [2, 3, 1], less, noise)
+    assert len(found) == 8 and found[0] == 0.0
+    for number in range(1, 8):
+        at = [k for block, own in enumerate(places) if number >> block & 1 for k in own]
+        alone = log_bayes_factors(values[at], covariance[np.ix_(at, at)], [len(at)], less, noise[at])
+        assert found[number] == pytest.approx(alone[1], rel=1e-9)
 
 
 def test_nothing_learnt_is_no_evidence_however_long_errors_last():

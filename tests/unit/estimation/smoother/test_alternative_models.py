@@ -1,5 +1,7 @@
 """What is reported without a target is the mixture over the alternative models."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -76,9 +78,7 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     x[NUMBERS] = known.imu
     models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=True)
     models.drifting = True
-    reported = camera_estimate(
-        known, models.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
-    )
+    reported = camera_estimate(replace(models.weighed(known, 1.0, compared=True), gyro_frame=False), 0.5, 0.5)
     mean, covariance = mixture(P, x)
     assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(
         mean[POSE][:3], abs=1e-9
@@ -88,6 +88,27 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
         covariance[POSE, POSE], rel=1e-6, abs=1e-13
     )
     assert reported.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[SHIFT, SHIFT]), rel=1e-6)
+
+
+@pytest.mark.parametrize("drifting", [False, True])
+def test_until_something_is_learnt_the_models_are_weighed_once_and_the_time_shift_moves_on(drifting):
+    known, _ = carry(7, 1.0)
+    known.camera = replace(known.camera, skew=3e-5)
+    models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=True)
+    models.drifting = drifting
+    weighed = models.weighed(known, 1.0, compared=True)
+    assert models.weighed(known, 1.0, compared=True) is weighed
+    later, then = camera_estimate(weighed, 0.5, 0.5, later_s=0.7), known.at(known.t_cam_s + 0.7)
+    anew = camera_estimate(models.weighed(then, 1.0, compared=True), 0.5, 0.5)
+    assert later.timeshift_cam_imu_s == pytest.approx(anew.timeshift_cam_imu_s, abs=1e-12)
+    assert later.timeshift_cam_imu_s != camera_estimate(weighed, 0.5, 0.5).timeshift_cam_imu_s
+    np.testing.assert_allclose(
+        later.calibration_covariance, anew.calibration_covariance, rtol=1e-6, atol=1e-15
+    )
+    for changes in ({"factor": 1.2, "compared": True}, {"factor": 1.0, "compared": False}):
+        assert models.weighed(known, **changes) is not weighed
+    models.stamp_sigma_s = 1e-5
+    assert models.weighed(known, 1.0, compared=True) is not weighed
 
 
 def test_what_is_asked_for_is_never_taken_as_stated():

@@ -76,7 +76,7 @@ def test_an_accelerometer_in_g_is_named_before_the_start():
     status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
     for k in range(400):
         status.saw_reading(5_000_000 * k, np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    estimate = status.estimate(None, running=False, gravity=[])
+    estimate = status.estimate(None, 0.0, running=False, gravity=[])
     assert estimate.status == Status.INCONSISTENT
     assert "in g instead of m/s^2" in estimate.reason
 
@@ -91,6 +91,6 @@ def test_a_clock_that_changes_again_and_again_is_in_doubt():
         status.saw_reading(second * 10**9, np.zeros(3), np.array([0.0, 0.0, 9.8]))
         if second in (10, 19):
             status.stepped(2e-3)
-        reasons.append(status.estimate(carry(0.01), running=True, gravity=[]).reason)
+        reasons.append(status.estimate(carry(0.01), 0.0, running=True, gravity=[]).reason)
     doubtful = [k for k, reason in enumerate(reasons) if reason == CLOCKS_IN_DOUBT]
     assert 19 <= doubtful[0] <= 21 and 27 <= doubtful[-1] <= 30 and len(doubtful) <= 9
