@@ -31,8 +31,11 @@ def runs():
     return {"cam0": simulate(SEED, LENGTH_S, rig=first), "cam1": simulate(SEED + 1, LENGTH_S, rig=second)}
 
 
-def calibrate(runs, seen, renumber=None, alike=False, silent=()):
-    """Feed both cameras where `seen(name, seconds)`; cam1 numbers by `renumber`. Estimates, one a second."""
+def calibrate(runs, seen, renumber=None, alike=False, silent=(), blank=False):
+    """Feed both cameras where `seen(name, seconds)`; cam1 numbers by `renumber`. Estimates, one a second.
+
+    `blank`: where it is not seen, images without points come, as from a detector.
+    """
     lens = runs["cam0"].rig.lens
     known = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
     options = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=alike)
@@ -46,7 +49,12 @@ def calibrate(runs, seen, renumber=None, alike=False, silent=()):
         )
         for name, run in runs.items()
         for f in run.frames
-        if seen(name, 1e-9 * (f.t_cam_ns - begin_ns))
+        if blank or seen(name, 1e-9 * (f.t_cam_ns - begin_ns))
+    ]
+    nothing = np.empty(0, np.int64), np.empty((0, 2))
+    frames = [
+        f if seen(f.camera, 1e-9 * (f.t_cam_ns - begin_ns)) else PointsFrame(f.camera, f.t_cam_ns, *nothing)
+        for f in frames
     ]
     frames.sort(key=lambda f: f.t_cam_ns)
     estimates, k = [], 0
@@ -100,6 +108,14 @@ def test_a_camera_that_comes_later_joins_those_that_are_calibrated(runs, seen):
     sigma_m = np.sqrt(np.diag(both.cameras["cam0"].T_imu_cam.covariance)[:3])
     before_m = np.sqrt(np.diag(alone[-1].cameras["cam0"].T_imu_cam.covariance)[:3])
     assert (sigma_m < 1.1 * before_m).all()  # nothing that was known is lost
+
+
+@pytest.mark.parametrize("from_s", [9.0, np.inf])
+def test_images_that_show_no_target_are_not_waited_for(runs, from_s):
+    """Detectors publish an empty list for each image in which they find no target."""
+    end = calibrate(runs, lambda name, t_s: name == "cam0" or t_s > from_s, blank=True)[-1]
+    assert list(end.cameras) == (["cam0", "cam1"] if from_s < LENGTH_S else ["cam0"])
+    assert largest_z(end, runs) < 4.0
 
 
 def test_a_camera_that_is_not_connected_is_not_waited_for(runs):

@@ -87,12 +87,14 @@ class Initializer:
             frames.clear()
 
     def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
-        """Keep images (stamp in the camera's clock in s, points).
+        """Keep images (stamp in the camera's clock in s, points) in which some of the target is seen.
 
         Of too many, those are dropped that are older than a start needs; of a rest before any motion, all but
         the last image.
         """
         for t_cam_s, frame in items:
+            if not len(frame.ids):
+                continue
             frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
             rest.take(t_cam_s, frame)

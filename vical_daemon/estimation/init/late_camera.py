@@ -66,6 +66,8 @@ class LateCameras:
             Whether it is of an absent camera, so that the filter cannot use it.
         """
         absent = frame.camera in f.absent
+        if not len(frame.ids):
+            return absent
         first_s = next((t_s for t_s, kept in self._frames if kept.camera == frame.camera), t_cam_s)
         if t_cam_s - first_s > LONG_S:  # it did not see enough, or does not fit: from another image on
             self.anew()
