@@ -56,7 +56,7 @@ class Fit(NamedTuple):
         change: Constants and jumps found minus those carried in, at the first image, as errors of
             `MarginalPrior`, shape (d,); zero for tilt, speed and biases.
         landmarks: How many.
-        parallax_deg: Typical angle under which a landmark's rays cross.
+        parallax: Typical angle under which a landmark's rays cross, over the noise of a ray.
         own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
     """
 
@@ -71,7 +71,7 @@ class Fit(NamedTuple):
     refused: int
     change: FloatArray
     landmarks: int
-    parallax_deg: float
+    parallax: float
     own_lens: FloatArray
 
 
@@ -346,7 +346,7 @@ class Bundle:
             int((~good).sum()) + len(w.bad),
             change,
             len(seen.begin),
-            parallax_deg(w, seen),
+            parallax(w, seen, self.problem.noise),
             covariance[:own, :own],
         )
 
@@ -388,14 +388,22 @@ def correlation(e: FloatArray, seen: Seen) -> float:
     return total
 
 
-def parallax_deg(window: Window, seen: Seen) -> float:
-    """Median angle between the first and last ray of the landmarks, deg."""
+LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
+
+
+def parallax(window: Window, seen: Seen, noise: ImageNoise) -> float:
+    """Median angle between the first and last ray of the landmarks, over the noise of one ray that lasts.
+
+    The information about speed and lever arm grows with the squared inverse distances as they are estimated,
+    noise included.
+    """
     last = np.concatenate([seen.begin[1:], [len(seen.frame)]]) - 1
     m = window.landmarks
     X = m.bearing + m.inverse[:, None] * m.anchor
     ends = [X - m.inverse[:, None] * window.p[seen.frame[at]] for at in (seen.begin, last)]
     a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12) for x in ends)
-    return float(np.rad2deg(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0)))))
+    angle = float(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))))
+    return angle * float(np.mean(window.camera.intrinsics[:2])) / (noise.sigma_px * noise.spread)
 
 
 def window_reports(problem: Problem, view: View) -> list[FrameReport]:
