@@ -97,10 +97,21 @@ class _Present:
     normal: Normal
     damping: float = _DAMPING
     cleaned: bool = False
+    failures: int = 0
 
-    def relax(self) -> None:
-        """A step succeeded."""
-        self.damping = max(0.01 * self.damping, _DAMPING)
+    def relax(self, gain: float = 1.0) -> None:
+        """A step succeeded, and lowered the sum of squares by `gain` times what was predicted.
+
+        [Nielsen, "Damping parameter in Marquardt's method", 1999]
+        """
+        self.failures = 0
+        factor = max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        self.damping = max(factor * self.damping, _DAMPING)
+
+    def tighten(self) -> None:
+        """A step failed."""
+        self.damping *= 10.0 if self.failures == 0 else 100.0
+        self.failures += 1
 
 
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
@@ -166,12 +177,13 @@ class Bundle:
         there = self._applied(step, now.view.seen)
         trial = self.problem.normal(there)
         if np.isfinite(trial.cost) and trial.cost <= now.normal.cost:
+            gain = (now.normal.cost - trial.cost) / max(step.predicted_reduction, 1e-300)
             now.view, now.normal = there, trial
-            now.relax()
+            now.relax(gain)
             return True
         for name, value in before.items():
             setattr(self.window, name, value)
-        now.damping *= 100.0
+        now.tighten()
         return False
 
     def _relinearised(self, now: _Present, buffer: ImuBuffer) -> _Present | None:

@@ -238,16 +238,16 @@ class TargetFreeInitializer:
         t_cam = np.array([s for s, f in frames if f.t_cam_ns in chained])
         result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
         shift, shifts = result.timeshift_cam_imu_s, _NEAR_S + (prior.timeshift_cam_imu_s or 0.0)
-        known = shift is not None and result.R_imu_cam is not None and result.status != "refused"
-        if known:
-            seeds.append((result.R_imu_cam, shift))
+        known = result.R_imu_cam if result.status != "refused" else None
+        if known is not None and shift is not None:
+            seeds.append((known, shift))
             shifts = np.array([shift])
             if prior.T_imu_cam is not None:
                 seeds.append((prior.T_imu_cam[0].copy(), shift))
         if result.status != "ok" and look_around:
             lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
-            seeds += likely_mountings(t, gyro, frames, lens, shifts)
-        return seeds, "" if known else result.reason
+            seeds += likely_mountings(t, gyro, frames, lens, shifts, known)
+        return seeds, result.reason if known is None else ""
 
 
 def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
