@@ -24,6 +24,7 @@ from vical_daemon.estimation.smoother import (
     alternative_models,
     bundle,
     clock_changes,
+    first_window,
     handover,
     normal,
     target_free_status,
@@ -154,7 +155,7 @@ FREE: dict[str, Mechanism] = {
     "free: parallax": Mechanism(
         WRONG,
         "windows whose rays hardly cross are given up",
-        lambda: [(target_free, "_MIN_PARALLAX_DEG", 0.0)],
+        lambda: [(target_free, "LEAST_PARALLAX", 0.0), (first_window, "LEAST_PARALLAX", 0.0)],
         **_RULE,
     ),
     "free: walk of the delay": Mechanism(

@@ -26,7 +26,7 @@ from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
-from vical_daemon.estimation.smoother.bundle import Bundle, Fit, window_reports
+from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow
@@ -49,7 +49,6 @@ from vical_daemon.estimation.status.evaluator import PATIENCE_S
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
 WINDOW_S = 6.0  # likewise, see `WINDOW_FRAMES`
-_MIN_PARALLAX_DEG = 0.4  # usual angle under which a landmark is seen: ten times the noise of a track
 _KEEP_S = 12.0  # of images that wait for a start or for inertial data
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _STEPS_GROW = 12  # Gauss-Newton steps for a window that grows; twice as many for its last fit
@@ -350,7 +349,7 @@ class TargetFreeCalibrator:
 
     def _agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Whether a window agrees with what was known of the calibration, as far as it shows that."""
-        if fit.parallax_deg < _MIN_PARALLAX_DEG:
+        if fit.parallax < LEAST_PARALLAX:
             return True
         return self.evaluator.agrees(fit, carry, complete=complete)
 
@@ -359,7 +358,7 @@ class TargetFreeCalibrator:
         window, carry = self.window, self.carry
         assert window is not None
         assert carry is not None
-        if fit.parallax_deg < _MIN_PARALLAX_DEG:
+        if fit.parallax < LEAST_PARALLAX:
             self.latest = carry if self._closed else None
             self._lost(Cause.NO_PARALLAX)
             return

@@ -284,11 +284,24 @@ def test_standing_still_gives_no_answer_and_says_what_to_do():
     assert "turn it to and fro" in record.guidance
 
 
-def test_features_that_are_soon_lost_give_no_answer_and_it_says_why():
-    run, _ = draw(42, 8.0, target_free=True)  # 60 images a second, of which each feature is lost in one of 20
+@pytest.mark.parametrize("seed", [42, 405], ids=["features soon lost", "narrow lens"])
+def test_rays_that_cross_by_a_quarter_of_a_degree_calibrate_a_camera_that_sees_that_well(seed):
+    run, _ = draw(seed, 9.0, target_free=True)
+    record = feed(run, subject_for(run))
+    assert record.snapshots[0].t_s < 6.0
+    last = record.snapshots[-1]
+    sigma = np.sqrt(np.diag(last.covariance))[:7]
+    assert sigma[:3].max() < 10e-3
+    assert np.abs(last.error[:7] / sigma).max() < 4.0
+
+
+def test_where_everything_is_far_away_there_is_no_answer_and_it_says_why():
+    miles = room_landmarks(4, near_m=3e3, far_m=30e3)
+    run = simulated(landmarks_m=miles)
     record = feed(run, subject_for(run))
     assert not record.snapshots
-    assert "features are lost before they show depth; collecting" in record.statuses[-1][2]
+    reasons = {reason for _, _, reason in record.statuses}
+    assert any("everything is far away, or features are lost before" in reason for reason in reasons)
 
 
 def test_one_axis_is_never_called_converged():

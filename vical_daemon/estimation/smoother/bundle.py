@@ -56,7 +56,7 @@ class Fit(NamedTuple):
         change: Constants and jumps found minus those carried in, at the first image, as errors of
             `MarginalPrior`, shape (d,); zero for tilt, speed and biases.
         landmarks: How many.
-        parallax_deg: Typical angle under which a landmark's rays cross.
+        parallax: Typical angle under which a landmark's rays cross, over the noise of a ray.
         own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
     """
 
@@ -71,7 +71,7 @@ class Fit(NamedTuple):
     refused: int
     change: FloatArray
     landmarks: int
-    parallax_deg: float
+    parallax: float
     own_lens: FloatArray
 
 
@@ -97,10 +97,21 @@ class _Present:
     normal: Normal
     damping: float = _DAMPING
     cleaned: bool = False
+    failures: int = 0
 
-    def relax(self) -> None:
-        """A step succeeded."""
-        self.damping = max(0.01 * self.damping, _DAMPING)
+    def relax(self, gain: float = 1.0) -> None:
+        """A step succeeded, and lowered the sum of squares by `gain` times what was predicted.
+
+        [Nielsen, "Damping parameter in Marquardt's method", 1999]
+        """
+        self.failures = 0
+        factor = max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        self.damping = max(factor * self.damping, _DAMPING)
+
+    def tighten(self) -> None:
+        """A step failed."""
+        self.damping *= 10.0 if self.failures == 0 else 100.0
+        self.failures += 1
 
 
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
@@ -166,12 +177,13 @@ class Bundle:
         there = self._applied(step, now.view.seen)
         trial = self.problem.normal(there)
         if np.isfinite(trial.cost) and trial.cost <= now.normal.cost:
+            gain = (now.normal.cost - trial.cost) / max(step.predicted_reduction, 1e-300)
             now.view, now.normal = there, trial
-            now.relax()
+            now.relax(gain)
             return True
         for name, value in before.items():
             setattr(self.window, name, value)
-        now.damping *= 100.0
+        now.tighten()
         return False
 
     def _relinearised(self, now: _Present, buffer: ImuBuffer) -> _Present | None:
@@ -346,7 +358,7 @@ class Bundle:
             int((~good).sum()) + len(w.bad),
             change,
             len(seen.begin),
-            parallax_deg(w, seen),
+            parallax(w, seen, self.problem.noise),
             covariance[:own, :own],
         )
 
@@ -388,14 +400,22 @@ def correlation(e: FloatArray, seen: Seen) -> float:
     return total
 
 
-def parallax_deg(window: Window, seen: Seen) -> float:
-    """Median angle between the first and last ray of the landmarks, deg."""
+LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
+
+
+def parallax(window: Window, seen: Seen, noise: ImageNoise) -> float:
+    """Median angle between the first and last ray of the landmarks, over the noise of one ray that lasts.
+
+    The information about speed and lever arm grows with the squared inverse distances as they are estimated,
+    noise included.
+    """
     last = np.concatenate([seen.begin[1:], [len(seen.frame)]]) - 1
     m = window.landmarks
     X = m.bearing + m.inverse[:, None] * m.anchor
     ends = [X - m.inverse[:, None] * window.p[seen.frame[at]] for at in (seen.begin, last)]
     a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12) for x in ends)
-    return float(np.rad2deg(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0)))))
+    angle = float(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))))
+    return angle * float(np.mean(window.camera.intrinsics[:2])) / (noise.sigma_px * noise.spread)
 
 
 def window_reports(problem: Problem, view: View) -> list[FrameReport]:

@@ -7,12 +7,13 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import NamedTuple
 
+from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.robust import MOST_STEPS
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
-from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.normal import ImageNoise
@@ -20,6 +21,7 @@ from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeI
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
+from vical_daemon.estimation.wording import cause_text
 
 DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
 
@@ -57,7 +59,12 @@ class FirstWindow:
         window = self.initializer.window(buffer, frames, known)
         if isinstance(window, str):
             return window
-        return self.adjusted(buffer, window, known, noise) or DOES_NOT_FIT
+        begun = self.adjusted(buffer, window, known, noise)
+        if begun is None:
+            return DOES_NOT_FIT
+        if known is None and begun.fit.parallax < LEAST_PARALLAX:
+            return cause_text(Cause.NO_PARALLAX)
+        return begun
 
     def of_another(
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior, stepped_s: float

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
 from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts
@@ -31,6 +30,7 @@ from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError,
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S
+from vical_daemon.estimation.temporal.mounting_search import likely_mountings
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES, track_orientations
 
@@ -45,6 +45,7 @@ class _Found(NamedTuple):
 
 
 _REACH_S = 2.0  # time shifts that are looked for, to both sides of what is given
+_NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where strung-together turns show none
 _SPAN_S = 5.0  # of images in the first attempt
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # likewise at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))  # of the mounting from rotations: a window converges from there
@@ -236,16 +237,17 @@ class TargetFreeInitializer:
         chained = set(chain.t_cam_ns.tolist())
         t_cam = np.array([s for s, f in frames if f.t_cam_ns in chained])
         result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
-        if result.timeshift_cam_imu_s is None or result.R_imu_cam is None or result.status == "refused":
-            return seeds, result.reason
-        R, shift = result.R_imu_cam, result.timeshift_cam_imu_s
-        seeds.append((R, shift))
-        if prior.T_imu_cam is not None:
-            seeds.append((prior.T_imu_cam[0].copy(), shift))
-        if result.status != "ok" and look_around:  # one axis may be off by far
-            tilt = np.deg2rad(20.0)
-            seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
-        return seeds, ""
+        shift, shifts = result.timeshift_cam_imu_s, _NEAR_S + (prior.timeshift_cam_imu_s or 0.0)
+        known = result.R_imu_cam if result.status != "refused" else None
+        if known is not None and shift is not None:
+            seeds.append((known, shift))
+            shifts = np.array([shift])
+            if prior.T_imu_cam is not None:
+                seeds.append((prior.T_imu_cam[0].copy(), shift))
+        if result.status != "ok" and look_around:
+            lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
+            seeds += likely_mountings(t, gyro, frames, lens, shifts, known)
+        return seeds, result.reason if known is None else ""
 
 
 def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
