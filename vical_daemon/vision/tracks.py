@@ -93,6 +93,7 @@ class _Features:
         self.templates = self.templates.joined(templates)
 
 
+_VERTEX_PX = 3  # half the window in which edges are looked for; a corner of FAST lies a pixel or two beside
 EPIPOLAR_EVERY = 5
 """Frames between the pictures that the epipolar check compares: enough parallax, little change."""
 MIN_EPIPOLAR = 15  # features: five decide an essential matrix, the others show outliers
@@ -254,9 +255,25 @@ class FeatureTracker:
         uv, response = uv[inside], response[inside]
         chosen = _best_of_empty_cells(uv, response, scale, taken)[:wanted]
         if len(chosen):
-            ids = np.arange(self._next_id, self._next_id + len(chosen), dtype=np.int64)
-            self._next_id += len(chosen)
-            features.add(ids, uv[chosen], Templates.cut(smooth, uv[chosen]), options.sigma_floor_px)
+            begin = _vertices(gray, uv[chosen])
+            same = (np.floor(begin * scale) == np.floor(uv[chosen] * scale)).all(axis=1)
+            begin = begin[same]  # the vertex in another cell may be a feature already
+            ids = np.arange(self._next_id, self._next_id + len(begin), dtype=np.int64)
+            self._next_id += len(begin)
+            features.add(ids, begin, Templates.cut(smooth, begin), options.sigma_floor_px)
+
+
+def _vertices(gray: Gray, uv: FloatArray) -> FloatArray:
+    """Move corners, found to a pixel or two, to where their edges meet.
+
+    A corner looks alike at every scale. A point beside it, held at one distance in the image, is no point of
+    the scene when the camera comes nearer; the vertex is.
+    """
+    halves, stop = (_VERTEX_PX, _VERTEX_PX), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    start = np.ascontiguousarray(uv[:, None, :], np.float32)
+    found = cv2.cornerSubPix(gray, start, halves, (-1, -1), stop).reshape(-1, 2).astype(np.float64)
+    near = np.linalg.norm(found - uv, axis=1) < _VERTEX_PX
+    return np.where(near[:, None], found, uv)
 
 
 def _best_of_empty_cells(

@@ -72,6 +72,27 @@ def test_features_spread_over_the_picture(pictures):
     assert len(cells) == len(found.ids)
 
 
+def squares(edge_px, offset_px):
+    """A blurred checkerboard, and the places of its corners, shape (n, 2)."""
+    x, y = (np.arange(n) - n / 2 - offset_px for n in (640, 480))
+    a, b = (np.tanh(0.35 * edge_px * np.sin(np.pi * v / edge_px)) for v in (x, y))
+    k = np.arange(-12, 13) * edge_px + offset_px
+    where = np.stack(np.meshgrid(k + 320, k + 240), axis=-1).reshape(-1, 2)
+    return (128 + 90 * b[:, None] * a[None, :]).astype(np.uint8), where
+
+
+def test_corners_are_followed_where_they_are_while_the_camera_comes_nearer():
+    tracker, off = FeatureTracker(), {}
+    for k in range(12):
+        picture, where = squares(45.3 * 1.02**k, 0.4)
+        found = tracker.detect(picture, stamp(k))
+        near = np.linalg.norm(found.uv_px[:, None] - where, axis=2).min(axis=1)
+        off.update(zip(found.ids.tolist(), near.tolist(), strict=True))
+    assert len(off) > 40
+    assert np.median(list(off.values())) < 0.1
+    assert np.mean(np.array(list(off.values())) > 0.3) < 0.1
+
+
 def test_gyro_rotation_is_the_cameras(rig):
     R, _ = rig.camera_pose_target(np.array([0.2, 0.25]))
     for shift_s in (0.0, 0.03):
