@@ -51,6 +51,7 @@ class FirstWindow:
     ) -> None:
         self._options, self._prior, self._layout, self._status = options, prior, layout, status
         self.initializer = TargetFreeInitializer(options, prior)
+        self._without_depth = False  # the rays of the last adjustment hardly cross
 
     def begin(
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: ImageNoise
@@ -60,11 +61,9 @@ class FirstWindow:
         if isinstance(window, str):
             return window
         begun = self.adjusted(buffer, window, known, noise)
-        if begun is None:
-            return DOES_NOT_FIT
-        if known is None and begun.fit.parallax < LEAST_PARALLAX:
+        if known is None and self._without_depth:
             return cause_text(Cause.NO_PARALLAX)
-        return begun
+        return begun or DOES_NOT_FIT
 
     def of_another(
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior, stepped_s: float
@@ -93,6 +92,7 @@ class FirstWindow:
             by_columns = self._solved(buffer, read_by_columns(window), known, noise, reopened)
             if by_columns[2] is not None and readout_sigmas(by_columns[2].carry) > readout_sigmas(fit.carry):
                 bundle, carry, fit = by_columns
+        self._without_depth = fit is not None and fit.parallax < LEAST_PARALLAX
         if fit is None or not (fit.settled and self._status.fits(fit, first=True)):
             return None
         if known is not None and not self._status.agrees(fit, carry, complete=False):

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, Frames
@@ -19,7 +18,7 @@ from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
-_TRIED = 600  # mountings: any rotation is within 27 deg of one of them
+_TRIED = 600  # mountings: any rotation is within 28 deg of one of them
 _NEAR_RAD = float(np.deg2rad(60.0))  # of what is known roughly: one axis may be off by far
 _MOST_FEATURES = 3000  # in pairs of images: more would only cost time
 _AGREE_PX = 2.0  # a feature so far from its line counts half: several times a tracker's noise
@@ -91,6 +90,6 @@ def even_rotations(count: int) -> FloatArray:
     inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
     alpha, beta = 2.0 * np.pi * s / np.sqrt(2.0), 2.0 * np.pi * s / 1.533751168755204288
     q = np.stack(
-        [inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)], axis=-1
+        [outer * np.cos(beta), inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta)], axis=-1
     )
-    return np.asarray(Rotation.from_quat(q).as_matrix())
+    return so3.matrix_from_quat(q)

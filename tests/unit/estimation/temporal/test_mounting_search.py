@@ -58,4 +58,4 @@ def test_only_mountings_near_what_is_known_are_returned(wall):
 def test_any_rotation_is_near_one_that_is_tried():
     tried, any_ = Rotation.from_matrix(even_rotations(600)), Rotation.random(20000, rng=1)
     half = np.clip(np.abs(any_.as_quat() @ tried.as_quat().T).max(axis=1), 0.0, 1.0)
-    assert np.rad2deg(2.0 * np.arccos(half.min())) < 27.0
+    assert np.rad2deg(2.0 * np.arccos(half.min())) < 28.0
