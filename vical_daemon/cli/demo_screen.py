@@ -12,6 +12,7 @@ from vical_daemon.bus.messages import decode_calibration, decode_diagnostics
 from vical_daemon.cli import live_table
 from vical_daemon.cli.errors import CliError
 from vical_daemon.estimation.result import CalibrationEstimate, Status
+from vical_daemon.offline.trace import Trace
 
 
 class Watch:
@@ -19,12 +20,16 @@ class Watch:
 
     def __init__(self, bus: Bus, rig: str, camera: str) -> None:
         self.estimate: CalibrationEstimate | None = None
-        self.trace: list[dict[str, Any]] = []
         self.health: dict[str, str] = {}
-        self._camera = camera
+        self._camera, self._trace = camera, Trace([camera])
         self._t_unsure_s = 0.0
         bus.subscribe(topics.CALIBRATION.key(rig, camera), self._on_estimate)
         bus.subscribe(topics.STATUS.pattern.format(rig=rig, name="*"), self._on_status)
+
+    @property
+    def trace(self) -> list[dict[str, Any]]:
+        """How the calibration developed, see `Trace`."""
+        return self._trace.points[self._camera]
 
     @property
     def duration_s(self) -> float:
@@ -60,23 +65,8 @@ class Watch:
         estimate = self.estimate = decode_calibration(sample.payload).estimate
         if estimate.status is not Status.CONVERGED:
             self._t_unsure_s = estimate.duration_s
-        camera = estimate.cameras.get(self._camera)
-        if camera is not None and (not self.trace or estimate.duration_s >= self.trace[-1]["t_s"] + 1.0):
-            sigma = [max(camera.T_imu_cam.covariance[i][i], 0.0) ** 0.5 for i in range(6)]
-            pose = camera.T_imu_cam
-            self.trace.append(
-                {
-                    "t_s": estimate.duration_s,
-                    "p_m": pose.p_m,
-                    "p_sigma_m": sigma[:3],
-                    "q_wxyz": pose.q_wxyz,
-                    "r_sigma_rad": sigma[3:],
-                    "timeshift_s": camera.timeshift_cam_imu_s,
-                    "timeshift_sigma_s": camera.timeshift_sigma_s,
-                    "nis_per_dof": estimate.nis_per_dof,
-                    "status": str(estimate.status),
-                }
-            )
+        if not self.trace or estimate.duration_s >= self.trace[-1]["t_s"] + 1.0:
+            self._trace.take(estimate)
 
     def _on_status(self, sample: Sample) -> None:
         for status in decode_diagnostics(sample.payload).statuses:

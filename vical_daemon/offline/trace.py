@@ -26,10 +26,11 @@ class Trace:
     def take(self, estimate: CalibrationEstimate) -> None:
         """Put an estimate down; one without newer data is left out."""
         imu, t_s = estimate.imu, estimate.duration_s
-        for name, camera in estimate.cameras.items():
-            points, pose = self.points[name], camera.T_imu_cam
-            if points and t_s <= points[-1]["t_s"]:
+        for name, points in self.points.items():
+            camera = estimate.cameras.get(name)
+            if camera is None or (points and t_s <= points[-1]["t_s"]):
                 continue
+            pose = camera.T_imu_cam
             sigma = np.sqrt(np.diag(np.array(pose.covariance))).tolist()
             points.append(
                 {

@@ -91,6 +91,7 @@ class _Present:
         normal: Normal equations.
         damping: Of the next step.
         cleaned: Observations that do not fit have been taken out.
+        failures: Steps in a row that were not taken.
     """
 
     view: View
@@ -109,7 +110,7 @@ class _Present:
         self.damping = max(factor * self.damping, _DAMPING)
 
     def tighten(self) -> None:
-        """A step failed."""
+        """A step failed. The second time the factor is larger: from `_DAMPING` it is a long way up."""
         self.damping *= 10.0 if self.failures == 0 else 100.0
         self.failures += 1
 
