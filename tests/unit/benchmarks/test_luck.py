@@ -62,7 +62,7 @@ def test_they_are_the_errors_of_vical_but_for_what_it_adds():
     for seed in (0, 1):
         run = make_run(KNOWN, seed, 12.0)
         (best,) = bounds(run, bound_options(KNOWN, run), [10.0], draw_of(run))
-        shot = feed(run, make_subject(KNOWN, run, seed, "vical")).at(10.0)
+        shot = feed(run, make_subject(KNOWN, run, seed, "vical"), until_s=10.1).at(10.0)
         sigma = np.array(bound_sigmas(best))[:7]
         apart = (np.array(shot.error)[:7] - vector_of(best, best.error)[:7]) / sigma
         assert np.abs(apart).max() < 1.0

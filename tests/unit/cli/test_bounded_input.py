@@ -233,7 +233,7 @@ def png(width: int, height: int) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-    content = chunk(b"IDAT", zlib.compress(bytes((width + 1) * height), 9))
+    content = chunk(b"IDAT", zlib.compress(bytes((width + 1) * height), 1))
     return b"\x89PNG\r\n\x1a\n" + header + content + chunk(b"IEND", b"")
 
 
@@ -241,7 +241,7 @@ def test_images_that_are_none_or_too_large_are_left_out(tmp_path: Path, sound: P
     camera = sound / "mav0" / "cam0"
     (camera / "corners.csv").unlink()
     (camera / "data").mkdir()
-    large = png(16_384, 16_384)  # 268 Mpx in 260 kB
+    large = png(16_384, 16_384)  # 268 Mpx in 1.2 MB
     stamps = [1_000_000_000 + 100_000_000 * i for i in range(20)]
     for number, stamp in enumerate(stamps):
         (camera / "data" / f"{stamp}.png").write_bytes(large if number % 2 else b"no image")
