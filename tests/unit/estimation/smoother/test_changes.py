@@ -56,7 +56,7 @@ def test_a_clock_that_is_set_moves_the_time_shift_alone(case, undisturbed):
 
 def test_a_bump_in_a_gap_is_announced_and_the_time_shift_is_kept():
     case = "bump in a gap of 5 s"
-    record = recorded(case, 2)
+    record = recorded(case, 1)
     judged = gaps.judged(record, case)
     assert judged["bumped_s"] < 3.0
     assert judged["lies"] == []
