@@ -49,7 +49,7 @@ RNG_SEED = 5
 
 @pytest.fixture(scope="module")
 def run():
-    return simulate(RNG_SEED, 50.0)
+    return simulate(RNG_SEED, 50.0, camera_rate_hz=10.0)
 
 
 def estimate(run, turned_deg=0.0):

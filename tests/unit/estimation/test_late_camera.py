@@ -14,7 +14,7 @@ from vical_daemon.estimation.init.late_camera import LateCameras
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import Status
 
-SEED, LENGTH_S = 1, 24.0
+SEED, LENGTH_S, RATE_HZ = 1, 24.0, 10.0
 TURN = Rotation.from_euler("yx", [15.0, 5.0], degrees=True).as_matrix()
 
 
@@ -28,7 +28,10 @@ def runs():
         p_imu_cam=first.p_imu_cam + np.array([0.08, -0.02, 0.03]),
         timeshift_cam_imu_s=0.012,
     )
-    return {"cam0": simulate(SEED, LENGTH_S, rig=first), "cam1": simulate(SEED + 1, LENGTH_S, rig=second)}
+    return {
+        "cam0": simulate(SEED, LENGTH_S, rig=first, camera_rate_hz=RATE_HZ),
+        "cam1": simulate(SEED + 1, LENGTH_S, rig=second, camera_rate_hz=RATE_HZ),
+    }
 
 
 def calibrate(runs, seen, renumber=None, alike=False, silent=(), blank=False):

@@ -89,12 +89,12 @@ def error_and_covariance(estimate, run):
 
 @pytest.fixture(scope="module")
 def first() -> SimulatedRun:
-    return simulate(10, 16.0, timeshift_cam_imu_s=SHIFT_S, corner_sigma_px=0.3)
+    return simulate(10, 16.0, timeshift_cam_imu_s=SHIFT_S, corner_sigma_px=0.3, camera_rate_hz=10.0)
 
 
 @pytest.fixture(scope="module")
 def second() -> SimulatedRun:
-    return simulate(1010, 16.0, rig=another(1010), corner_sigma_px=0.3)
+    return simulate(1010, 16.0, rig=another(1010), corner_sigma_px=0.3, camera_rate_hz=10.0)
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +180,7 @@ def test_a_recording_that_shows_nothing_is_left_behind(first, shown_s) -> None:
 
 def test_a_camera_that_was_moved_in_between_is_noticed(first, after_first) -> None:
     moved = another(2010, p_imu_cam=reference_rig(1).p_imu_cam + np.array([0.03, 0.0, 0.0]))
-    run = simulate(2010, 16.0, rig=moved, corner_sigma_px=0.3)
+    run = simulate(2010, 16.0, rig=moved, corner_sigma_px=0.3, camera_rate_hz=10.0)
     c = pickle.loads(after_first)
     c.estimate()
     c.next_recording()
@@ -190,9 +190,9 @@ def test_a_camera_that_was_moved_in_between_is_noticed(first, after_first) -> No
 
 def test_clocks_that_drift_have_another_time_shift_in_the_next_recording() -> None:
     rig = replace(reference_rig(10, timeshift_cam_imu_s=SHIFT_S), clock_skew_ppm=100.0)
-    first = simulate(10, 16.0, rig=rig, corner_sigma_px=0.3)
+    first = simulate(10, 16.0, rig=rig, corner_sigma_px=0.3, camera_rate_hz=10.0)
     late = replace(another(1010), clock_skew_ppm=100.0, timeshift_cam_imu_s=SHIFT_S + 0.3)
-    second = simulate(1010, 16.0, rig=late, corner_sigma_px=0.3)
+    second = simulate(1010, 16.0, rig=late, corner_sigma_px=0.3, camera_rate_hz=10.0)
     c = calibrator(first)
     feed(c, items(first))
     c.next_recording()

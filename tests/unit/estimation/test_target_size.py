@@ -17,7 +17,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions
 def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset(), **rig_changes):
     """What is reported of a rig whose board is `size` times as large as in its file (shape (3,): x, y, z)."""
     rig = reference_rig(seed, timeshift_cam_imu_s=0.01, **rig_changes)
-    run = simulate(seed, seconds, rig=rig)
+    run = simulate(seed, seconds, rig=rig, camera_rate_hz=10.0)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"} if lens_known else ()), estimate=estimate, imu_noise=imu_noise(run)
     )

@@ -21,7 +21,7 @@ OPTIONS = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=True)
 
 @cache
 def a_run() -> SimulatedRun:
-    return simulate(700, 20.0)
+    return simulate(700, 20.0, camera_rate_hz=10.0)
 
 
 def calibrate(upside_down, seen, options: CalibrationOptions = OPTIONS) -> CalibrationEstimate:

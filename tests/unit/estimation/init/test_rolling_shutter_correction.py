@@ -76,7 +76,7 @@ def test_rows_are_seen_from_where_the_rig_was_by_then():
 def test_a_rolling_shutter_does_not_delay_the_start(seed, rate_dps, axis, said):
     """Not when its first image is seen by a filter that does not know yet how fast the rig turns, either."""
     rig = replace(fast_rig(seed, rate_dps=rate_dps), readout_axis=axis)
-    run = simulate(seed, 7.0, rig=rig, corner_sigma_px=0.2)
+    run = simulate(seed, 7.0, rig=rig, corner_sigma_px=0.2, camera_rate_hz=10.0)
     prior = camera_prior(run, seed, StartErrors(0.03, 5.0), exact_lens=False)
     prior = replace(prior, readout_s=READOUT_S if said == "how long" else 0.0)
     estimate = frozenset({"readout"} if said == "that it is" else ())

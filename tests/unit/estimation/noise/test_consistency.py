@@ -95,7 +95,7 @@ def test_whether_the_model_fits_is_not_known_from_a_few_images():
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 60.0])
 def test_the_factor_does_not_depend_on_the_rate_of_the_images(rate_hz):
     """Errors that last for half a second count as many images as that is."""
-    rng, n = np.random.default_rng(4), int(400 * rate_hz)
+    rng, n = np.random.default_rng(4), int(200 * rate_hz)
     rho = np.exp(-2.0 / rate_hz)
     a = np.zeros((n, 8))
     for k in range(1, n):
