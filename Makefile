@@ -17,12 +17,12 @@ demo: $(VENV)/.user
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -q $(PYTEST_ARGS) tests
 
-check: $(VENV)/.check
+check: $(VENV)/.check  # imports early: the tests of .ci/run, next to it, find their bytecode
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python .ci/import_everything.py
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports --no-cache
-	$(BIN)/python .ci/import_everything.py
 	$(BIN)/python .ci/constraints.py check
 
 bench: $(VENV)/.user
