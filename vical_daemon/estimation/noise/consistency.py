@@ -9,7 +9,8 @@ the eight smooth modes of a plane's image, make it honest again:
 * `scale` multiplies the variance of the corners until the innovations have the size they should have. It
   changes the weight of images against the IMU, so it moves slowly and within bounds.
 * `factor` is the long-run variance of the innovations over the variance that the filter predicts: errors that
-  last for k images are k times less informative than it counts. It multiplies the *reported* covariance only;
+  last for k images are k times less informative than it counts. Until images have been seen for 15 s, it is
+  extrapolated from shorter sums. It multiplies the *reported* covariance only;
   fed back into the gain it would run away (less weight for images, more drift, larger innovations). It also
   contains what `scale` cannot explain: at few images a second the predicted motion adds more to an innovation
   than the corners do.
@@ -26,7 +27,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, PERHAPS_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 MODES = 8  # of an image: the degrees of freedom of a homography
 _TELLING = 30
@@ -142,6 +143,8 @@ class Consistency:
     _lasting: float = 0.0  # excess of the long-run variance over its standard deviation
     _short: float = 0.0  # sum of the squared innovations of images
     _long: float = 0.0  # of squared sums of the innovations over 3 s, over the number of images in them
+    _pairs: float = 0.0  # of the numbers of other images in these sums
+    _others: float = 0.0  # other images in 3 s, at the present rate
     _sum: FloatArray = field(default_factory=lambda: np.zeros(MODES))
     _recent: deque[_Innovation] = field(default_factory=deque)
 
@@ -187,7 +190,7 @@ class Consistency:
         """Enough images have been seen, and their errors neither last nor exceed their noise.
 
         Errors that last are ruled out where the long-run variance is less than one standard deviation above
-        what the filter predicts; sigmas grow where it is `LIKELY_SIGMAS` above.
+        what the filter predicts; sigmas grow where it is `PERHAPS_SIGMAS` above.
         """
         return self._weight >= _TELLING and self.scale == 1.0 and self._lasting < 1.0
 
@@ -251,7 +254,8 @@ class Consistency:
         """
         if self._weight >= self.memory:
             keep = 1.0 - 1.0 / self.memory
-            self._weight, self._short, self._long = keep * self._weight, keep * self._short, keep * self._long
+            self._weight, self._pairs = keep * self._weight, keep * self._pairs
+            self._short, self._long = keep * self._short, keep * self._long
         self._weight += 1.0
         self._recent.append(_Innovation(t_s, normal))
         self._sum += normal
@@ -261,9 +265,25 @@ class Consistency:
         images = len(self._recent)
         self._short += float(normal @ normal)
         self._long += float(self._sum @ self._sum) / images
+        self._pairs += images - 1.0
+        span_s = t_s - self._recent[0].t_s
+        if span_s > 0.0:
+            self._others = (images - 1.0) * max(_LASTS_S / span_s, 1.0)
         more = self._long / (MODES * self._weight) - 1.0
         noise = math.sqrt(
             (4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight)
         )  # of white innovations
         self._lasting = more / noise
-        self.factor = 1.0 + more if more > max(LIKELY_SIGMAS * noise, _FLOOR) else 1.0
+        lasts = more > max(PERHAPS_SIGMAS * noise, _FLOOR)
+        self.factor = 1.0 + more + self._not_seen_to_end() if lasts else 1.0
+
+    def _not_seen_to_end(self) -> float:
+        """By how much the long-run variance would be larger, had all sums been over 3 s.
+
+        Early sums are shorter. Errors that last throughout them may last for 3 s: what they add then is in
+        proportion to the number of other images in a sum.
+        """
+        if not self._pairs:
+            return 0.0
+        lasting = max(self._long - self._short, 0.0) / MODES
+        return lasting * max(self._others / self._pairs - 1.0 / self._weight, 0.0)

@@ -113,6 +113,51 @@ def test_the_factor_does_not_depend_on_the_rate_of_the_images(rate_hz):
     assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)
 
 
+def lasting(seed, lasts_s, seconds, rate_hz=20.0):
+    """Innovations of which half the variance lasts for so long; the factor after 4 s and at the end."""
+    rng, n = np.random.default_rng(seed), int(seconds * rate_hz)
+    rho = np.exp(-1.0 / (lasts_s * rate_hz))
+    a, factors, c = rng.normal(size=8), [], Consistency(memory=n)
+    for k in range(n):
+        a = rho * a + np.sqrt(1.0 - rho**2) * rng.normal(size=8)
+        own = np.median(SIGMA) / np.sqrt(len(UV)) * np.sqrt(0.5) * (a + rng.normal(size=8))
+        c.learn(k / rate_hz, UV, (modes(UV) @ own).reshape(-1, 2), LINEAR, np.eye(3), SIGMA)
+        factors.append(c.factor)
+    return factors[int(4.0 * rate_hz)], factors[-1]
+
+
+def test_the_factor_of_the_first_seconds_is_that_of_many():
+    """Errors that last for seconds look shorter in sums over less than a second; they may even last longer."""
+    early, late = np.transpose([lasting(seed, lasts_s=2.0, seconds=40.0) for seed in range(20)])
+    assert late.mean() == pytest.approx(1.0 + 0.5 * 59 * 0.65, rel=0.2)  # 0.65: mean correlation within 3 s
+    assert 0.9 < early.mean() / late.mean() < 1.5
+    assert early.min() > 0.4 * late.mean()
+
+
+def test_larger_errors_that_do_not_last_are_not_extrapolated():
+    """White innovations of five times their variance, for 4 s."""
+    factors = []
+    for seed in range(20):
+        c, ways, rng = Consistency(), modes(UV), np.random.default_rng(seed)
+        for k in range(90):
+            common = (ways @ rng.normal(size=8) * 2.0).reshape(-1, 2)
+            c.learn(k / 20.0, UV, common, ways, np.eye(8), SIGMA * np.sqrt(c.scale))
+        factors.append(c.factor / c.level)
+    assert 0.7 < np.median(factors) < 1.5
+
+
+def test_honest_innovations_seldom_widen_the_sigmas_of_the_first_seconds():
+    """In 100 rigs, 4 s to 10 s: three standard deviations."""
+    wide = 0
+    for seed in range(100):
+        c, rng = Consistency(), np.random.default_rng(seed)
+        feed(c, rng, 70)
+        for _ in range(12):
+            feed(c, rng, 10)
+            wide += c.factor > 1.0
+    assert wide <= 0.01 * 100 * 12
+
+
 def test_a_jump_is_an_alarm_within_half_a_second():
     c = Consistency()
     feed(c, np.random.default_rng(2), 400)
