@@ -12,6 +12,7 @@ from pathlib import Path
 from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.bags import BagRecording
 from vical_daemon.logs.checks import check_camera, check_imu
+from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
 from vical_daemon.logs.recorded_logs import McapRecording
 
@@ -69,7 +70,7 @@ def _open(
     path: Path, topics: Collection[str] | None, cameras: Collection[str], as_recorded: bool
 ) -> Recording:
     if path.is_dir():
-        if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
+        if segments_in(path):  # also of a ROS 2 bag folder: our reader bears damage
             return McapRecording(path, topics, as_recorded=as_recorded)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics, as_recorded=as_recorded)

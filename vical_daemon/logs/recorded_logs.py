@@ -9,6 +9,7 @@ from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
-from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.mcap import PART_SUFFIX, LogError, LogReader, segments_in
 from vical_daemon.logs.model import (
     PREFERENCE,
     ImuArrays,
@@ -424,9 +425,9 @@ class McapRecording(LogRecording):
     """One MCAP file, or a folder of the segments of one recording."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        for path in self._files():
+        for path, size in self._files:
             try:
-                reader = LogReader(path)
+                reader = LogReader(_as_named_now(path), size)
                 for message in reader.messages():
                     channel = message.channel
                     if channel.encoding == "cdr":
@@ -440,7 +441,13 @@ class McapRecording(LogRecording):
             if not self._scanned:
                 self.warnings.extend(reader.warnings)
 
-    def _files(self) -> list[Path]:
-        if self.path.is_dir():
-            return sorted(self.path.glob("*.mcap"))
-        return [self.path]
+    @cached_property
+    def _files(self) -> list[tuple[Path, int]]:
+        """Files and their sizes when they were first read: a recorder may still write the last one."""
+        paths = segments_in(self.path) if self.path.is_dir() else [self.path]
+        return [(path, path.stat().st_size) for path in paths]
+
+
+def _as_named_now(path: Path) -> Path:
+    """Return a file under its final name if the recorder has finished it meanwhile."""
+    return path.with_suffix("") if path.suffix == PART_SUFFIX and not path.exists() else path

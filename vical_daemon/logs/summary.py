@@ -22,7 +22,7 @@ class TopicSummary:
     """One topic.
 
     Attributes:
-        topic: Topic or key.
+        topic: Topic; of an ASL folder the file.
         type_name: ROS 2 type, or kind of stream.
         count: Messages.
         rate_hz: One over the median interval of the stamps.
@@ -99,12 +99,18 @@ def summarise_log(path: Path) -> Summary:
 
 def summarise_recording(recording: Recording) -> Summary:
     """Summarise any other recording: its sensors."""
-    tallies = {stream.key: _Tally(stream.kind) for stream in recording.streams}
+    topics = {stream.key: _source(recording.path, stream.source) for stream in recording.streams}
+    tallies = {topics[stream.key]: _Tally(stream.kind) for stream in recording.streams}
     for key, payload in recording.messages(recording.streams):
-        tally = tallies[key]
+        tally = tallies[topics[key]]
         tally.stamps.append(stamp_of(payload) or 0)
         tally.bytes += len(payload)
     return _summary(recording.path, tallies, list(recording.warnings), True, {}, {})
+
+
+def _source(recording: Path, source: str) -> str:
+    """Name a topic as the recording does, and a file by its place in the folder."""
+    return str(Path(source).relative_to(recording)) if Path(source).is_relative_to(recording) else source
 
 
 def _fit(value: int) -> int:

@@ -2,7 +2,7 @@
 
 from vical_daemon.logs.mcap.files import PART_SUFFIX, LogError, describe, is_being_written
 from vical_daemon.logs.mcap.folder import LogFolder
-from vical_daemon.logs.mcap.reader import LogChannel, LogMessage, LogReader
+from vical_daemon.logs.mcap.reader import LogChannel, LogMessage, LogReader, segments_in
 from vical_daemon.logs.mcap.recover import Recovery, recover, recover_folder, recovered_name
 from vical_daemon.logs.mcap.session import Attachment, LogSession
 from vical_daemon.logs.mcap.writer import LogWriter
@@ -23,4 +23,5 @@ __all__ = [
     "recover",
     "recover_folder",
     "recovered_name",
+    "segments_in",
 ]
