@@ -93,13 +93,18 @@ def _as_text(summary: Summary, problem: str) -> str:
     ]
     lines += [_row(topic) for topic in summary.topics]
     for name, values in summary.metadata.items():
-        lines.append(f"metadata {name}: " + ", ".join(f"{key}={value}" for key, value in values.items()))
+        lines.append(f"metadata {name}: " + ", ".join(f"{k}={_short(v)}" for k, v in values.items()))
     for name, size in summary.attachments.items():
         lines.append(f"attachment {name}: {size} bytes")
     lines += [f"warning: {warning}" for warning in summary.warnings]
     if problem:
         lines.append(f"not fit for calibration: {problem}")
     return "\n".join(lines)
+
+
+def _short(value: str) -> str:
+    """Return a value, or the size of a text: ROS 2 stores the whole metadata.yaml of a bag as one."""
+    return f"({len(value)} characters)" if "\n" in value else value
 
 
 def _row(topic: TopicSummary) -> str:

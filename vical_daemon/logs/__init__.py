@@ -6,9 +6,13 @@ ROS 1 bag or an ASL/EuRoC folder, checks that units and rates can be right, and 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from pathlib import Path
 
+from vical_drivers.user_files import read_text
+
+from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.bags import BagRecording
 from vical_daemon.logs.checks import check_camera, check_imu
@@ -66,22 +70,62 @@ def check_recording(recording: Recording) -> None:
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
 
 
+_NEEDED = "expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder (with mav0/imu0/data.csv)"
+_UNPACKERS = {
+    ".gz": "gunzip -k",
+    ".bz2": "bunzip2 -k",
+    ".xz": "unxz -k",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+    ".zip": "unzip",
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".7z": "7z x",
+}
+_MESSAGES_PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?message", re.IGNORECASE | re.MULTILINE)
+
+
 def _open(
     path: Path, topics: Collection[str] | None, cameras: Collection[str], as_recorded: bool
 ) -> Recording:
     if path.is_dir():
-        if segments_in(path):  # also of a ROS 2 bag folder: our reader bears damage
+        if segments_in(path) and not _packs_messages(path):  # also of a ROS 2 bag: our reader bears damage
             return McapRecording(path, topics, as_recorded=as_recorded)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics, as_recorded=as_recorded)
+        if any(path.glob("*.bag")):
+            raise RecordingError(f"{path} holds ROS 1 bags: give the files, {path}/*.bag")
+        if any(path.glob("*.db3")):
+            raise RecordingError(f"{path} lacks the metadata.yaml of a ROS 2 bag: ros2 bag reindex {path}")
         return AslRecording(path, topics, cameras, as_recorded=as_recorded)
+    of_a_bag = (path.parent / "metadata.yaml").is_file()
     if path.suffix == ".bag":
         return BagRecording(path, topics, as_recorded=as_recorded)
+    if path.suffix == ".mcap" and of_a_bag and _packs_messages(path.parent):
+        return BagRecording(path.parent, topics, as_recorded=as_recorded)
     if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
         return McapRecording(path, topics, as_recorded=as_recorded)
-    if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
+    if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap.zstd", "metadata.yaml")):
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
-    raise RecordingError(
-        f"{path} is no recording: expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder "
-        "(with mav0/imu0/data.csv)"
-    )
+    raise RecordingError(f"{path} {_why_not(path)}")
+
+
+def _packs_messages(bag: Path) -> bool:
+    """Whether each message of a ROS 2 bag is packed, which only its metadata tells."""
+    try:
+        return bool(_MESSAGES_PACKED.search(read_text(bag / "metadata.yaml", MAX_BYTES)))
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _why_not(path: Path) -> str:
+    """Say why a file is no recording, and what to do."""
+    if not path.is_file():
+        return "is a pipe or a device: a recording is read more than once, copy it into a file"
+    if path.name.endswith(".bag.active"):
+        return f"was not finished by its recorder: mv {path.name} {path.stem}; rosbag reindex {path.stem}"
+    if path.suffix in _UNPACKERS:
+        return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
+    if path.suffix == ".db3":
+        return f"lacks its metadata.yaml: ros2 bag reindex {path.parent}"
+    return f"is no recording: {_NEEDED}"

@@ -57,6 +57,7 @@ _KIND_OF_TYPE: dict[str, Kind] = {
     TRACKS_TYPE: "tracks",
 }
 _STAMP = struct.Struct("<iI")
+_ZSTD = b"\x28\xb5\x2f\xfd"  # RFC 8878
 # Offsets of rates and forces from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
 _IMU_NUMBERS = 37 * 8
@@ -170,6 +171,8 @@ class LogRecording(Recording):
                 stamp_ns = None
             if stamp_ns is None or (not channel.stamps and not _readable(channel, raw.payload)):
                 channel.unreadable += 1
+                if raw.payload.startswith(_ZSTD):
+                    channel.problem = "each is packed by zstd: give the bag with its metadata.yaml"
                 continue
             if channel.kind == "imu":
                 channel.values += raw.payload[_GYRO]
