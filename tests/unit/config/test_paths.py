@@ -39,5 +39,5 @@ def test_a_session_folder_that_is_not_there_or_not_ours_is_not_used(monkeypatch,
 
 
 def test_a_folder_that_cannot_be_made_names_the_setting():
-    with pytest.raises(OSError, match="set VICAL_RUNTIME_DIR or bus.socket"):
+    with pytest.raises(OSError, match=r"set VICAL_RUNTIME_DIR or bus\.socket"):
         make_private(Path("/proc/nope/vical"))
