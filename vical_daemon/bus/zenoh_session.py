@@ -42,7 +42,9 @@ _LOCKED = (
     "this process may lock too little memory to share them; to share: ulimit -l unlimited, or "
     "LimitMEMLOCK=infinity in a unit"
 )
-_NO_SHM = "there is no /dev/shm, or it is full or read-only; to share: mount it (in a container: --shm-size 64m)"
+_NO_SHM = (
+    "there is no /dev/shm, or it is full or read-only; to share: mount it (in a container: --shm-size 64m)"
+)
 _warned = False
 # Batches of 64 kB: without shared memory an image of 360 kB takes six of "data".
 _QUEUE_SIZES = {
