@@ -63,7 +63,9 @@ def check_recording(recording: Recording) -> None:
         RecordingError: A value is implausible, or imu or camera are missing.
     """
     if not recording.imus:
-        raise RecordingError(f"{recording.path} holds no IMU data; `vical info` shows what is in it")
+        raise RecordingError(
+            f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
+        )
     for name in recording.imus:
         recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
     for stream in recording.cameras.values():

@@ -214,7 +214,6 @@ class LogRecording(Recording):
                 self._statuses[raw.topic] = raw.topic.removeprefix("/")
             return None
         if parsed is not None:
-            self.rig = parsed.rig
             name, key = parsed.name, raw.topic.removeprefix("/")
         else:
             name = self._name(raw.topic, kind)
@@ -222,8 +221,19 @@ class LogRecording(Recording):
         if self._wanted is not None and not {raw.topic, raw.topic.removeprefix("/"), name} & self._wanted:
             self._others[raw.topic] = raw.type_name
             return None
+        if parsed is not None:
+            self._belongs_to(parsed.rig, kind, name)
         channel = self._channels[raw.topic] = _Channel(key, kind, name)
         return channel
+
+    def _belongs_to(self, rig: str, kind: Kind, name: str) -> None:
+        """Note the rig of a sensor; refuse a second one of its name, with which it would be mixed."""
+        if any(c.kind == kind and c.name == name for c in self._channels.values()):
+            raise RecordingError(
+                f"{self.path} holds {name} of two rigs, {self.rig} and {rig}: give the files of one, "
+                "or its topics"
+            )
+        self.rig = rig
 
     def _name(self, topic: str, kind: Kind) -> str:
         """Make a name of a foreign topic that no other of its kind has."""
