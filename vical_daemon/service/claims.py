@@ -13,7 +13,6 @@ from pathlib import Path
 from vical_drivers.closing import Closing
 
 _log = logging.getLogger(__name__)
-_FOLDER = "claims"
 _POLL_S = 0.1
 
 
@@ -38,10 +37,9 @@ class Claims(Closing):
     def __init__(self, folder: Path, names: Iterable[str], wait_s: float, stop: threading.Event) -> None:
         self._held: list[int] = []
         end_s = time.monotonic() + wait_s
-        (folder / _FOLDER).mkdir(mode=0o755, exist_ok=True)
         try:
             for name in names:
-                path = folder / _FOLDER / name
+                path = folder / f"{name}.claim"  # for reading: root may have made it
                 self._held.append(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644))
                 free = _lock(self._held[-1])
                 if not free:

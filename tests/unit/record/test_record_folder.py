@@ -119,3 +119,21 @@ def test_quota_reads_the_folder_once_a_segment(tmp_path, monkeypatch):
     assert not folder.enforce_quota(tmp_path / "next", 40)
     assert [path.name[-9:-5] for path in folder.enforce_quota(tmp_path / "next", 70)] == ["0000"]
     assert [path.name[-9:-5] for path in folder.enforce_quota(tmp_path / "next", 85)] == ["0001", "0002"]
+
+
+def test_a_lock_file_that_root_made_is_no_obstacle(tmp_path, monkeypatch):
+    """`sudo vical run record`, once, and the service could no longer record."""
+    really_open = os.open
+
+    def open_as_other_user(path, flags, *mode, **more):
+        if Path(path).name == ".recorder.lock" and flags & os.O_RDWR:
+            raise PermissionError(13, "Permission denied", str(path))
+        return really_open(path, flags, *mode, **more)
+
+    (tmp_path / ".recorder.lock").touch()
+    monkeypatch.setattr(os, "open", open_as_other_user)
+    first, second = LogFolder(tmp_path), LogFolder(tmp_path)
+    assert first.lock() and not second.lock()
+    first.unlock()
+    assert second.lock()
+    second.unlock()

@@ -57,7 +57,7 @@ class LogFolder:
         self.unlock()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            descriptor = _open_lock(self.path / _LOCK)
         except OSError as error:
             raise LogError(f"cannot record into {self.path}: {describe(error)}") from None
         try:
@@ -139,6 +139,14 @@ def run_name(rig: str, unix_ns: int) -> str:
     """Return the first part of the segment names of one run; unique even if the clock is set back."""
     begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
     return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{secrets.token_hex(3)}"
+
+
+def _open_lock(path: Path) -> int:
+    """Open the lock file; for reading if another user (root, once) made it. Over NFS a lock needs writing."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except PermissionError:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 
 def _size(path: Path) -> int:
