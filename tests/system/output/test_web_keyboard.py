@@ -46,6 +46,9 @@ def test_keyboard_names_and_a_new_connection_in_a_browser(served, web_feed, brow
         assert await page.evaluate("page.camera + document.activeElement.textContent") == "cam1cam1"
         assert await page.evaluate("document.querySelectorAll('#tabs [tabindex=\"0\"]').length") == 1
 
+        enter = "new KeyboardEvent('keydown', {key: 'Enter', cancelable: true})"
+        assert not await page.evaluate(f"$('token').dispatchEvent({enter})"), "Enter would accept"
+
         # what the browser does on an answer like 502: it closes the source, for good
         await page.evaluate("window.gone = page.source; gone.close(); gone.onerror()")
         assert await page.evaluate("document.getElementById('link').textContent") == "offline, trying again"
