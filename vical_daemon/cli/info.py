@@ -54,12 +54,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _summarise(path: Path) -> tuple[Summary, str]:
     """Return what a recording holds, and why `vical calibrate` would not take it (empty: it would)."""
-    from vical_daemon.logs import RecordingError, check_recording, open_recording
-    from vical_daemon.logs.summary import summarise_log, summarise_recording
+    from vical_daemon.logs import RecordingError, check_recording, mcap_files, open_recording
+    from vical_daemon.logs.summary import summarise_logs, summarise_recording
 
     problem = ""
-    if path.is_file() and (path.suffix == ".mcap" or path.name.endswith(".mcap.part")):
-        summary = summarise_log(path)
+    files = mcap_files(path)
+    if files and path.exists():
+        summary = summarise_logs(path, files)
         try:
             check_recording(open_recording(path, check=False))
         except RecordingError as error:

@@ -20,7 +20,16 @@ from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
 from vical_daemon.logs.recorded_logs import McapRecording
 
-__all__ = ["ImuArrays", "Kind", "Recording", "RecordingError", "Stream", "check_recording", "open_recording"]
+__all__ = [
+    "ImuArrays",
+    "Kind",
+    "Recording",
+    "RecordingError",
+    "Stream",
+    "check_recording",
+    "mcap_files",
+    "open_recording",
+]
 
 
 def open_recording(
@@ -90,9 +99,9 @@ _MESSAGES_PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?message", re.IGNOR
 def _open(
     path: Path, topics: Collection[str] | None, cameras: Collection[str], as_recorded: bool
 ) -> Recording:
+    if mcap_files(path):
+        return McapRecording(path, topics, as_recorded=as_recorded)
     if path.is_dir():
-        if segments_in(path) and not _packs_messages(path):  # also of a ROS 2 bag: our reader bears damage
-            return McapRecording(path, topics, as_recorded=as_recorded)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics, as_recorded=as_recorded)
         if any(path.glob("*.bag")):
@@ -103,13 +112,20 @@ def _open(
     of_a_bag = (path.parent / "metadata.yaml").is_file()
     if path.suffix == ".bag":
         return BagRecording(path, topics, as_recorded=as_recorded)
-    if path.suffix == ".mcap" and of_a_bag and _packs_messages(path.parent):
-        return BagRecording(path.parent, topics, as_recorded=as_recorded)
-    if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
-        return McapRecording(path, topics, as_recorded=as_recorded)
-    if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap.zstd", "metadata.yaml")):
+    if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap", ".mcap.zstd", "metadata.yaml")):
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
     raise RecordingError(f"{path} {_why_not(path)}")
+
+
+def mcap_files(path: Path) -> list[Path]:
+    """Return the MCAP files of a recording, also of a ROS 2 bag; none: it is of another kind.
+
+    Our reader bears damage, that of bags does not.
+    """
+    if path.is_dir():
+        return [] if _packs_messages(path) else segments_in(path)
+    named = path.suffix == ".mcap" or path.name.endswith(".mcap.part")
+    return [path] if named and not _packs_messages(path.parent) else []
 
 
 def _packs_messages(bag: Path) -> bool:

@@ -73,28 +73,35 @@ class _Tally:
     bytes: int = 0
 
 
-def summarise_log(path: Path) -> Summary:
-    """Summarise one MCAP file, every topic of it.
+def summarise_logs(path: Path, files: list[Path]) -> Summary:
+    """Summarise MCAP files of one recording, every topic of them.
+
+    Args:
+        path: As the user named the recording.
+        files: Its files, in their order.
 
     Raises:
-        LogError: It is no MCAP file.
+        LogError: One is no MCAP file.
     """
-    reader = LogReader(path)
     tallies: dict[str, _Tally] = {}
-    for message in reader.messages():
-        channel = message.channel
-        tally = tallies.get(channel.topic)
-        if tally is None:
-            tally = tallies[channel.topic] = _Tally(channel.type_name)
-        stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
-        # TFMessage and String do not start with a stamp
-        plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
-        tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
-        tally.arrivals.append(_fit(message.log_time_ns))
-        tally.bytes += len(message.payload)
-    metadata = {name: values for name, values in reader.metadata}  # noqa: C416
-    attachments = {item.name: len(item.data) for item in reader.attachments}
-    return _summary(path, tallies, list(reader.warnings), reader.complete, metadata, attachments)
+    readers = [LogReader(file) for file in files]
+    for reader in readers:
+        for message in reader.messages():
+            channel = message.channel
+            tally = tallies.get(channel.topic)
+            if tally is None:
+                tally = tallies[channel.topic] = _Tally(channel.type_name)
+            stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
+            # TFMessage and String do not start with a stamp
+            plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
+            tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
+            tally.arrivals.append(_fit(message.log_time_ns))
+            tally.bytes += len(message.payload)
+    metadata = {name: values for reader in readers for name, values in reader.metadata}
+    attachments = {item.name: len(item.data) for reader in readers for item in reader.attachments}
+    warnings = [warning for reader in readers for warning in reader.warnings]
+    complete = all(reader.complete for reader in readers)
+    return _summary(path, tallies, warnings, complete, metadata, attachments)
 
 
 def summarise_recording(recording: Recording) -> Summary:

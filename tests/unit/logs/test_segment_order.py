@@ -68,6 +68,22 @@ def test_info_names_topics_as_the_recording_does(split, asl_folder, capsys):
     assert topics == ["mav0/cam0/corners.csv", "mav0/imu0/data.csv"]
 
 
+def test_info_of_a_folder_says_as_much_as_of_its_files(tmp_path, capsys):
+    for segment in range(2):
+        with LogWriter(tmp_path / f"a_{segment}.mcap", {"vical": {"segment": str(segment)}}) as writer:
+            for i in range(50 * segment, 50 * segment + 50):
+                stamp = BEGIN_NS + i * 10_000_000
+                payload = m.encode_imu(stamp, "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+                writer.write(IMU, payload, stamp + 3_000_000)
+            writer.write("vical/rig0/command/record", m.encode_string("start"), stamp)
+            writer.attach("config.yaml", "text/yaml", b"rig: rig0", stamp)
+    assert main(["info", str(tmp_path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    command, imu = found["topics"]
+    assert (command["count"], imu["count"], imu["latency_ms"]) == (2, 100, [3.0, 3.0])
+    assert found["metadata"]["vical"]["segment"] == "1" and found["attachments"] == {"config.yaml": 9}
+
+
 def test_a_file_that_is_being_written_is_the_same_in_every_pass(tmp_path):
     """Stamps that are put on an even grid in the second pass are those of the first."""
     rng = np.random.default_rng(1)
