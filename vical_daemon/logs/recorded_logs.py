@@ -32,7 +32,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
-from vical_daemon.logs.mcap import PART_SUFFIX, LogError, LogReader, segments_in
+from vical_daemon.logs.mcap import LogError, LogReader, segments_in, size_now
 from vical_daemon.logs.model import (
     PREFERENCE,
     ImuArrays,
@@ -440,7 +440,7 @@ class McapRecording(LogRecording):
     def _raw(self) -> Iterator[RawMessage]:
         for path, size in self._files:
             try:
-                reader = LogReader(_as_named_now(path), size)
+                reader = LogReader(path, size)
                 for message in reader.messages():
                     channel = message.channel
                     if channel.encoding == "cdr":
@@ -458,9 +458,4 @@ class McapRecording(LogRecording):
     def _files(self) -> list[tuple[Path, int]]:
         """Files and their sizes when they were first read: a recorder may still write the last one."""
         paths = segments_in(self.path) if self.path.is_dir() else [self.path]
-        return [(path, path.stat().st_size) for path in paths]
-
-
-def _as_named_now(path: Path) -> Path:
-    """Return a file under its final name if the recorder has finished it meanwhile."""
-    return path.with_suffix("") if path.suffix == PART_SUFFIX and not path.exists() else path
+        return [(path, size_now(path)) for path in paths]

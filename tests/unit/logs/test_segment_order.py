@@ -11,7 +11,7 @@ import pytest
 from vical_daemon.bus import messages as m
 from vical_daemon.cli import main
 from vical_daemon.logs import open_recording
-from vical_daemon.logs.mcap import LogWriter, segments_in
+from vical_daemon.logs.mcap import LogReader, LogWriter, segments_in
 from vical_daemon.logs.recorded_logs import stamp_of
 
 IMU = "vical/rig0/imu/imu0"
@@ -104,3 +104,23 @@ def test_a_file_that_is_being_written_is_the_same_in_every_pass(tmp_path):
     assert sum(1 for _ in recording.messages()) == 2000
     writer.close()
     assert sum(1 for _ in recording.messages()) == 2000  # finished, and renamed
+
+
+def test_segments_that_are_finished_while_a_folder_is_read_are_not_lost(split, monkeypatch):
+    """A recorder that rotates gives its part the final name between two looks at the folder."""
+    part = (split / "bag_11.mcap").rename(split / "bag_11.mcap.part")
+    glob = Path.glob
+
+    def then_finished(folder, pattern):
+        yield from list(glob(folder, pattern))
+        if part.exists():
+            part.rename(split / "bag_11.mcap")
+
+    monkeypatch.setattr(Path, "glob", then_finished)
+    assert len(stamps(split)) == 600
+    (split / "bag_11.mcap").rename(part)
+    found = segments_in(split)
+    if part.exists():
+        part.rename(split / "bag_11.mcap")
+    assert len(found) == 12 and LogReader(part).channels == []
+    assert sum(1 for _ in LogReader(part).messages()) == 50

@@ -2,7 +2,7 @@
 
 from vical_daemon.logs.mcap.files import PART_SUFFIX, LogError, describe, is_being_written
 from vical_daemon.logs.mcap.folder import LogFolder
-from vical_daemon.logs.mcap.reader import LogChannel, LogMessage, LogReader, segments_in
+from vical_daemon.logs.mcap.reader import LogChannel, LogMessage, LogReader, segments_in, size_now
 from vical_daemon.logs.mcap.recover import Recovery, recover, recover_folder, recovered_name
 from vical_daemon.logs.mcap.session import Attachment, LogSession
 from vical_daemon.logs.mcap.writer import LogWriter
@@ -24,4 +24,5 @@ __all__ = [
     "recover_folder",
     "recovered_name",
     "segments_in",
+    "size_now",
 ]

@@ -92,7 +92,7 @@ class LogReader:
             LogError: It cannot be read, or is not an MCAP file.
         """
         try:
-            with open_file(self.path) as file:
+            with open_now(self.path) as file:
                 head = file.read(len(MAGIC))
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
@@ -118,7 +118,7 @@ class LogReader:
         self._restart()
         stopped = False
         try:
-            with open_file(self.path) as file:
+            with open_now(self.path) as file:
                 size = os.fstat(file.fileno()).st_size
                 size = size if self.end is None else min(size, self.end)
                 self._budget = Budget(size)
@@ -259,18 +259,39 @@ class LogReader:
         self._channels[channel.id] = LogChannel(channel.topic, name, channel.message_encoding, text, encoding)
 
 
+def open_now(path: Path) -> BinaryIO:
+    """Open a file; a part that its recorder has finished meanwhile, under its final name.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    try:
+        return open_file(path)
+    except FileNotFoundError:
+        finished = path.with_suffix("")
+        if path.suffix != PART_SUFFIX or not finished.exists():
+            raise
+        return open_file(finished)
+
+
+def size_now(path: Path) -> int:
+    """Return the size of a file as `open_now` opens it; 0: it is gone, or another kind of file."""
+    try:
+        with open_now(path) as file:
+            return os.fstat(file.fileno()).st_size
+    except OSError:
+        return 0
+
+
 def segments_in(folder: Path) -> list[Path]:
     """Return the MCAP files of a folder in the order of their first messages, also an unfinished one.
 
     Names do not tell the order: ROS 2 calls the segments of a bag _0, _1, ... _10.
     """
+    parts = list(folder.glob(f"*.mcap{PART_SUFFIX}"))  # first: one that is finished now is then found twice
     finished = list(folder.glob("*.mcap"))
-    parts = [
-        part
-        for part in folder.glob(f"*.mcap{PART_SUFFIX}")
-        if part.with_suffix("") not in finished and part.stat().st_size
-    ]
-    return sorted(finished + parts, key=lambda path: (_begin_ns(path), path.name))
+    begun = [part for part in parts if part.with_suffix("") not in finished and size_now(part)]
+    return sorted(finished + begun, key=lambda path: (_begin_ns(path), path.name))
 
 
 def _begin_ns(path: Path) -> int:
