@@ -137,3 +137,16 @@ def test_a_lock_file_that_root_made_is_no_obstacle(tmp_path, monkeypatch):
     first.unlock()
     assert second.lock()
     second.unlock()
+
+
+def test_runs_of_one_second_are_in_the_order_of_their_files(tmp_path):
+    """Their marks are random: a recorder that takes over at once may have the smaller one."""
+    paths = [
+        tmp_path / f"rig0_20261121T022842Z_{mark}_{index:04d}.mcap"
+        for mark in ("ffffff", "000000")
+        for index in (0, 1)
+    ]
+    for age, path in enumerate(paths):
+        path.write_bytes(b"x")
+        os.utime(path, (1e9 + age, 1e9 + age))
+    assert LogFolder(tmp_path).segments() == paths

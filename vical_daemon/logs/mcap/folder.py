@@ -7,8 +7,10 @@ import os
 import re
 import secrets
 import shutil
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from vical_daemon.logs.mcap.files import LogError, describe
 from vical_daemon.logs.mcap.recover import Recovery, recover_folder
@@ -95,13 +97,17 @@ class LogFolder:
         Their age is that in their names. The time of a file would be that of its recovery or copy, and
         it steps with the wall clock, which the names do not until the next boot.
         """
-        dated = []
+        dated: list[tuple[str, str, int, Path]] = []
+        oldest: dict[str, int] = {}
         for path in self.path.glob("*.mcap"):
             match = _OURS.fullmatch(path.name)
             if match:
                 begin, run, segment, _ = match.groups()
                 dated.append((begin, run, int(segment), path))
-        return [path for *_, path in sorted(dated)]
+                oldest[run] = min(oldest.get(run, sys.maxsize), _about(path).mtime_ns)
+        # Runs of one second in the order of their files.
+        dated.sort(key=lambda item: (item[0], oldest[item[1]], *item[1:]))
+        return [path for *_, path in dated]
 
     def enforce_quota(self, open_segment: Path | None = None, open_bytes: int = 0) -> list[Path]:
         """Delete the oldest segments until all, with the open one, fit; returns what was deleted.
@@ -114,7 +120,7 @@ class LogFolder:
             self._finished_bytes, self._open_segment = None, open_segment
         if self._finished_bytes is not None and self._finished_bytes + open_bytes <= self._quota_bytes:
             return []
-        sizes = {path: _size(path) for path in self.segments()}
+        sizes = {path: _about(path).size for path in self.segments()}
         total, deleted = sum(sizes.values()), []
         for path in sizes:
             if total + open_bytes <= self._quota_bytes:
@@ -149,9 +155,15 @@ def _open_lock(path: Path) -> int:
         return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 
-def _size(path: Path) -> int:
-    """Bytes of a file; 0 if somebody has just removed it."""
+class _About(NamedTuple):
+    size: int
+    mtime_ns: int
+
+
+def _about(path: Path) -> _About:
+    """Return size and time of a file; zeros if somebody has just removed it."""
     try:
-        return path.stat().st_size
+        found = path.stat()
     except FileNotFoundError:
-        return 0
+        return _About(0, 0)
+    return _About(found.st_size, found.st_mtime_ns)
