@@ -38,6 +38,13 @@ _ENOUGH_LOCKED_BYTES = 64 * 2**20
 (5.4 MiB each, measured: tests/system/test_shared_memory.py)."""
 _CAP_IPC_LOCK = 14
 """Number of the capability in linux/capability.h."""
+_LOCKED = (
+    "this process may lock too little memory to share them; to share: ulimit -l unlimited, or "
+    "LimitMEMLOCK=infinity in a unit"
+)
+_NO_SHM = (
+    "there is no /dev/shm, or it is full or read-only; to share: mount it (in a container: --shm-size 64m)"
+)
 _warned = False
 # Batches of 64 kB: without shared memory an image of 360 kB takes six of "data".
 _QUEUE_SIZES = {
@@ -71,16 +78,12 @@ def _may_lock_anything() -> bool:
     return found is not None and bool(int(found[1], 16) >> _CAP_IPC_LOCK & 1)
 
 
-def _warn_of_copies() -> None:
-    """Log once per process that images are copied, and which limit to raise."""
+def _warn_of_copies(why: str) -> None:
+    """Log once per process that images are copied, why, and what to do."""
     global _warned
     if not _warned:
         _warned = True
-        _log.info(
-            "the bus copies images, because this process may lock too little memory to share them "
-            "(costs processor time, loses nothing); to share: ulimit -l unlimited, or LimitMEMLOCK=infinity "
-            "in a unit"
-        )
+        _log.info("the bus copies images, because %s (costs processor time, loses nothing)", why)
 
 
 def base_config(*, router: bool = False) -> dict[str, Any]:
@@ -182,14 +185,14 @@ def open_session(config: dict[str, Any]) -> Any:
     """Open a session, without shared memory if the process may lock too little."""
     shared = config["transport"]["shared_memory"]["enabled"]
     if not shared:
-        _warn_of_copies()
+        _warn_of_copies(_LOCKED)
     try:
         return _open(config)
     except zenoh.ZError as error:
         text = str(error)
         if not shared or ("shm" not in text.lower() and "shared memory" not in text.lower()):
             raise BusError(_explain(config, text)) from None
-    _warn_of_copies()  # /dev/shm is missing or full
+    _warn_of_copies(_NO_SHM)
     config["transport"]["shared_memory"] = {"enabled": False}
     try:
         return _open(config)

@@ -99,7 +99,7 @@ def _log_folders() -> list[Path]:
     folders = [Path(d) for d in os.environ.get("LOGS_DIRECTORY", "").split(":") if d]
     state = os.environ.get("XDG_STATE_HOME", "")
     home = os.environ.get("HOME", "")
-    if state:
+    if Path(state).is_absolute():
         folders.append(Path(state) / "vical")
     elif home:
         folders.append(Path(home) / ".local" / "state" / "vical")

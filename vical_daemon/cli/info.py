@@ -54,12 +54,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _summarise(path: Path) -> tuple[Summary, str]:
     """Return what a recording holds, and why `vical calibrate` would not take it (empty: it would)."""
-    from vical_daemon.logs import RecordingError, check_recording, open_recording
-    from vical_daemon.logs.summary import summarise_log, summarise_recording
+    from vical_daemon.logs import RecordingError, check_recording, mcap_files, open_recording
+    from vical_daemon.logs.summary import summarise_logs, summarise_recording
 
     problem = ""
-    if path.is_file() and (path.suffix == ".mcap" or path.name.endswith(".mcap.part")):
-        summary = summarise_log(path)
+    files = mcap_files(path)
+    if files and path.exists():
+        summary = summarise_logs(path, files)
         try:
             check_recording(open_recording(path, check=False))
         except RecordingError as error:
@@ -93,13 +94,18 @@ def _as_text(summary: Summary, problem: str) -> str:
     ]
     lines += [_row(topic) for topic in summary.topics]
     for name, values in summary.metadata.items():
-        lines.append(f"metadata {name}: " + ", ".join(f"{key}={value}" for key, value in values.items()))
+        lines.append(f"metadata {name}: " + ", ".join(f"{k}={_short(v)}" for k, v in values.items()))
     for name, size in summary.attachments.items():
         lines.append(f"attachment {name}: {size} bytes")
     lines += [f"warning: {warning}" for warning in summary.warnings]
     if problem:
         lines.append(f"not fit for calibration: {problem}")
     return "\n".join(lines)
+
+
+def _short(value: str) -> str:
+    """Return a value, or the size of a text: ROS 2 stores the whole metadata.yaml of a bag as one."""
+    return f"({len(value)} characters)" if "\n" in value else value
 
 
 def _row(topic: TopicSummary) -> str:

@@ -82,8 +82,10 @@ def suggest(word: str, known: list[str]) -> str:
 
     >>> suggest("calibarte", ["calibrate", "check"])
     '; did you mean calibrate?'
+    >>> suggest("nope", ["kalibr", "opencv"])
+    ''
     """
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.7)
     return f"; did you mean {near[0]}?" if near else ""
 
 

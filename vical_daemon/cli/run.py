@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.config.model import Config
+    from vical_daemon.service.claims import Claims
 
 _log = logging.getLogger(__name__)
 _TICK_S = 1.0
 _POLL_S = 0.2
+_CLAIM_S = 12.0  # a process that was told to stop is usually gone; a child that fails later is tried again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,6 +66,28 @@ def run(args: argparse.Namespace) -> int:
     return leave(code)
 
 
+def _claims(config: Config, roles: list[str], stop: threading.Event) -> Claims:
+    """Claim what only one process may publish; `record` and `web` settle that by their folder and port.
+
+    Raises:
+        CliError: Another process does it.
+    """
+    from vical_daemon.config.paths import make_private, runtime_directory
+    from vical_daemon.service.claims import ClaimedError, Claims
+
+    cameras = list(config.cameras)
+    devices = {"imu": list(config.imus), "camera": cameras, "detect": cameras, "estimate": cameras}
+    names = [f"{config.rig}.{role}.{device}" for role in roles for device in devices.get(role, [])]
+    try:
+        return Claims(make_private(runtime_directory()), names, _CLAIM_S, stop)
+    except ClaimedError as error:
+        rig, role, device = str(error).split(".")
+        raise CliError(
+            f"another process already runs the role {role} for {device} of {rig}; stop it first "
+            "(systemctl status 'vical-*')"
+        ) from None
+
+
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
     from vical_daemon.cli.bus_access import open_for_roles
@@ -74,10 +98,10 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # stopped while waiting for the router
         return 0
-    notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
-    threads = RoleThreads(config, bus)
     try:
-        with emulated_devices(config, roles) as options:
+        with _claims(config, roles, stop), emulated_devices(config, roles) as options:
+            notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
+            threads = RoleThreads(config, bus)
             try:
                 for role in reversed(roles):
                     threads.start(role, options.get(role))

@@ -15,8 +15,10 @@ def runtime_directory() -> Path:
     given = chosen_runtime_directory()
     if given is not None:
         return given
-    session = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(session) / "vical" if session else Path(tempfile.gettempdir()) / f"vical-{os.getuid()}"
+    session = _absolute("XDG_RUNTIME_DIR")
+    if session is not None and _is_own(session):
+        return session / "vical"
+    return Path(tempfile.gettempdir()) / f"vical-{os.getuid()}"
 
 
 def chosen_runtime_directory() -> Path | None:
@@ -30,9 +32,9 @@ def state_directory() -> Path:
     given = os.environ.get("VICAL_STATE_DIR") or _first("STATE_DIRECTORY")
     if given:
         return Path(given)
-    home = os.environ.get("XDG_STATE_HOME")
-    if home:
-        return Path(home) / "vical"
+    home = _absolute("XDG_STATE_HOME")
+    if home is not None:
+        return home / "vical"
     try:
         return Path.home() / ".local" / "state" / "vical"
     except RuntimeError:  # a user without HOME and without a passwd entry
@@ -43,12 +45,30 @@ def make_private(folder: Path) -> Path:
     """Create a folder that only this user (and group) may enter, and return it.
 
     Raises:
-        PermissionError: It belongs to another user, who could place files there.
+        OSError: It cannot be made, or belongs to another user, who could place files there.
     """
-    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    try:
+        folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    except OSError as error:
+        reason = f"cannot be made ({error.strerror}); set VICAL_RUNTIME_DIR or bus.socket"
+        raise OSError(error.errno, reason, str(folder)) from None
     if folder.stat().st_uid not in (os.getuid(), 0):
         raise PermissionError(13, "belongs to another user; set VICAL_RUNTIME_DIR", str(folder))
     return folder
+
+
+def _absolute(variable: str) -> Path | None:
+    """Return a folder that the session names; a relative one counts as none (XDG base directories)."""
+    path = Path(os.environ.get(variable, ""))
+    return path if path.is_absolute() else None
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether a folder exists and is this user's: after `su` the variable names that of another session."""
+    try:
+        return folder.stat().st_uid == os.getuid()
+    except OSError:
+        return False
 
 
 def _first(variable: str) -> str:

@@ -6,16 +6,30 @@ ROS 1 bag or an ASL/EuRoC folder, checks that units and rates can be right, and 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from pathlib import Path
 
+from vical_drivers.user_files import read_text
+
+from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.bags import BagRecording
 from vical_daemon.logs.checks import check_camera, check_imu
+from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
 from vical_daemon.logs.recorded_logs import McapRecording
 
-__all__ = ["ImuArrays", "Kind", "Recording", "RecordingError", "Stream", "check_recording", "open_recording"]
+__all__ = [
+    "ImuArrays",
+    "Kind",
+    "Recording",
+    "RecordingError",
+    "Stream",
+    "check_recording",
+    "mcap_files",
+    "open_recording",
+]
 
 
 def open_recording(
@@ -58,29 +72,78 @@ def check_recording(recording: Recording) -> None:
         RecordingError: A value is implausible, or imu or camera are missing.
     """
     if not recording.imus:
-        raise RecordingError(f"{recording.path} holds no IMU data; `vical info` shows what is in it")
+        raise RecordingError(
+            f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
+        )
     for name in recording.imus:
         recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
     for stream in recording.cameras.values():
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
 
 
+_NEEDED = "expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder (with mav0/imu0/data.csv)"
+_UNPACKERS = {
+    ".gz": "gunzip -k",
+    ".bz2": "bunzip2 -k",
+    ".xz": "unxz -k",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+    ".zip": "unzip",
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".7z": "7z x",
+}
+_MESSAGES_PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?message", re.IGNORECASE | re.MULTILINE)
+
+
 def _open(
     path: Path, topics: Collection[str] | None, cameras: Collection[str], as_recorded: bool
 ) -> Recording:
+    if mcap_files(path):
+        return McapRecording(path, topics, as_recorded=as_recorded)
     if path.is_dir():
-        if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
-            return McapRecording(path, topics, as_recorded=as_recorded)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics, as_recorded=as_recorded)
+        if any(path.glob("*.bag")):
+            raise RecordingError(f"{path} holds ROS 1 bags: give the files, {path}/*.bag")
+        if any(path.glob("*.db3")):
+            raise RecordingError(f"{path} lacks the metadata.yaml of a ROS 2 bag: ros2 bag reindex {path}")
         return AslRecording(path, topics, cameras, as_recorded=as_recorded)
+    of_a_bag = (path.parent / "metadata.yaml").is_file()
     if path.suffix == ".bag":
         return BagRecording(path, topics, as_recorded=as_recorded)
-    if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
-        return McapRecording(path, topics, as_recorded=as_recorded)
-    if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
+    if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap", ".mcap.zstd", "metadata.yaml")):
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
-    raise RecordingError(
-        f"{path} is no recording: expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder "
-        "(with mav0/imu0/data.csv)"
-    )
+    raise RecordingError(f"{path} {_why_not(path)}")
+
+
+def mcap_files(path: Path) -> list[Path]:
+    """Return the MCAP files of a recording, also of a ROS 2 bag; none: it is of another kind.
+
+    Our reader bears damage, that of bags does not.
+    """
+    if path.is_dir():
+        return [] if _packs_messages(path) else segments_in(path)
+    named = path.suffix == ".mcap" or path.name.endswith(".mcap.part")
+    return [path] if named and not _packs_messages(path.parent) else []
+
+
+def _packs_messages(bag: Path) -> bool:
+    """Whether each message of a ROS 2 bag is packed, which only its metadata tells."""
+    try:
+        return bool(_MESSAGES_PACKED.search(read_text(bag / "metadata.yaml", MAX_BYTES)))
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _why_not(path: Path) -> str:
+    """Say why a file is no recording, and what to do."""
+    if not path.is_file():
+        return "is a pipe or a device: a recording is read more than once, copy it into a file"
+    if path.name.endswith(".bag.active"):
+        return f"was not finished by its recorder: mv {path.name} {path.stem}; rosbag reindex {path.stem}"
+    if path.suffix in _UNPACKERS:
+        return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
+    if path.suffix == ".db3":
+        return f"lacks its metadata.yaml: ros2 bag reindex {path.parent}"
+    return f"is no recording: {_NEEDED}"

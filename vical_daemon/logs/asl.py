@@ -167,9 +167,9 @@ class AslRecording(Recording):
             for path in (folder / f"{stem}.csv", folder / f"{stem}.csv.gz"):
                 if path.is_file():
                     return self._read_points(path, folder.name, kind)
-        path = folder / "data.csv"
-        if path.is_file():
-            return self._read_images(path, *image_list(path, folder))
+        for path in (folder / "data.csv", folder / "data.csv.gz"):
+            if path.is_file():
+                return self._read_images(path, *image_list(path, folder))
         stamps, files = images_by_name(folder)
         if len(stamps) < len(files):
             self.warnings.append(

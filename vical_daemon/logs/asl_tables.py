@@ -52,6 +52,8 @@ def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> n
     dtype = np.dtype([(name, _type_read(dtype, name, text, begin)) for name in dtype.names or ()])
     if next(_data_lines(text, begin), None) is None:
         raise RecordingError(f"{path}: no data below its title")
+    if _has_decimal_commas(text, begin):
+        raise RecordingError(f"{path}: more columns than its title: write decimal points, not commas")
     try:
         rows: npt.NDArray[Any] = np.loadtxt(
             io.BytesIO(text[begin:]),
@@ -92,6 +94,19 @@ def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
         hint = f", separated by {other}; separate them by commas, with points in the numbers" if other else ""
         return f"line {number} is not {count} numbers{hint}: {found!r}"
     return "a stamp or an id is no integer, or too large"
+
+
+def _has_decimal_commas(text: bytes, begin: int) -> bool:
+    """Whether the first row has more cells than the title, and no point: 0.35 would be read as 0 and 35."""
+    _, row = next(_data_lines(text, begin))
+    title = text[: begin or text.find(b"\n")]
+    named = begin > 0 or title.startswith((b"#", b"\xef\xbb\xbf#"))
+    return (
+        named
+        and title.count(b",") > 1
+        and row.rstrip(b", \r\n").count(b",") > title.count(b",")
+        and b"." not in row
+    )
 
 
 def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
@@ -137,7 +152,7 @@ def read_table(path: Path) -> bytes:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
     if not text or text.isspace():
         raise RecordingError(f"{path} is empty")
-    return text
+    return text.replace(b'"', b"")  # some programs put every cell between quotes
 
 
 def _unpacked(path: Path) -> bytes:
@@ -209,10 +224,12 @@ def _is_stamp(name: str) -> bool:
 def imu_tables(root: Path) -> dict[str, Path]:
     """Return the tables of inertial readings of a folder by the names of the IMUs, in order of these.
 
-    ``imu0/data.csv`` (ASL) or ``imu0.csv`` (Kalibr's `kalibr_bagcreater`; also ``imu.csv``).
+    ``imu0/data.csv`` (ASL) or ``imu0.csv`` (Kalibr's `kalibr_bagcreater`; also ``imu.csv``), or packed.
     """
-    found = {p.stem: p for p in root.glob("imu*.csv") if re.fullmatch(r"imu[0-9]*", p.stem)}
-    found |= {p.parent.name: p for p in root.glob("imu*/data.csv")}
+    beside = sorted(root.glob("imu*.csv.gz")) + sorted(root.glob("imu*.csv"))
+    found = {p.name.split(".")[0]: p for p in beside if re.fullmatch(r"imu[0-9]*\.csv(\.gz)?", p.name)}
+    for name in ("data.csv.gz", "data.csv"):
+        found |= {p.parent.name: p for p in root.glob(f"imu*/{name}")}
     return dict(sorted(found.items()))
 
 

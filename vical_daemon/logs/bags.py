@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.recorded_logs import LogRecording, RawMessage
 
 _ROS1 = b"#ROSBAG V2.0\n"  # wiki.ros.org/Bags/Format/2.0
+_RECENT_BYTES = 32 * 2**20  # 40 chunks of the usual 768 kB
 
 
 @contextmanager
@@ -80,8 +81,10 @@ def _bounded(budget: Budget) -> Iterator[None]:
     from rosbags.rosbag2 import reader as ros2
 
     unpackers, zstd = dict(ros1.decompressors), ros2.zstd
-    ros1.decompressors["bz2"] = lambda data: _spend(budget, _decompress_bz2(data))
-    ros1.decompressors["lz4"] = lambda data: _spend(budget, decompress_lz4(memoryview(data), CHUNK_LIMIT))
+    ros1.decompressors["bz2"] = _RecentChunks(budget, _decompress_bz2)
+    ros1.decompressors["lz4"] = _RecentChunks(
+        budget, lambda data: decompress_lz4(memoryview(data), CHUNK_LIMIT)
+    )
     ros2.zstd = _Zstd(zstd, budget)
     try:
         yield
@@ -101,6 +104,27 @@ def _decompress_bz2(data: bytes) -> bytes:
 def _spend(budget: Budget, data: bytes) -> bytes:
     budget.spend(len(data))
     return data
+
+
+class _RecentChunks:
+    """Unpacks chunks of ROS 1; keeps the last ones, because rosbags reads by time and keeps only one.
+
+    A recorder writes messages as they arrive, so at a chunk's end their times alternate between two chunks
+    (of streams with other delays: among several).
+    """
+
+    def __init__(self, budget: Budget, unpack: Callable[[bytes], bytes]) -> None:
+        self._budget, self._unpack = budget, unpack
+        self._chunks: dict[bytes, bytes] = {}  # packed -> unpacked, the last used at the end
+
+    def __call__(self, packed: bytes) -> bytes:
+        data = self._chunks.pop(packed, None)
+        if data is None:
+            data = _spend(self._budget, self._unpack(packed))
+        self._chunks[packed] = data
+        while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > _RECENT_BYTES:
+            del self._chunks[next(iter(self._chunks))]
+        return data
 
 
 class _Zstd:

@@ -23,6 +23,7 @@ _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
+_COPY = "is one of the files a copy of another?"
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
 
 
@@ -48,7 +49,7 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     if step_ns <= 0:
         raise RecordingError(
             f"{name}: most stamps are equal to others ({len(np.unique(t_ns))} different ones in {len(t_ns)} "
-            "samples); does the driver fill them, with nanoseconds?"
+            f"samples); does the driver fill them, with nanoseconds? Or {_COPY}"
         )
     rate_hz = 1e9 / step_ns
     if rate_hz > _FASTEST_IMU_HZ:
@@ -170,6 +171,8 @@ def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
     """
     if stream.count < 3:
         raise RecordingError(f"{stream.name}: only {stream.count} frames in {stream.source}")
+    if stream.rate_hz == 0.0:  # the median interval
+        raise RecordingError(f"{stream.name}: most of its frames come twice, {_COPY}")
     if not _SLOWEST_CAMERA_HZ <= stream.rate_hz <= _FASTEST_CAMERA_HZ:
         raise RecordingError(
             f"{stream.name}: {stream.rate_hz:.3g} frames a second by its stamps; {_SLOWEST_CAMERA_HZ:g} to "

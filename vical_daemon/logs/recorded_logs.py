@@ -9,6 +9,7 @@ from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
-from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.mcap import LogError, LogReader, segments_in, size_now
 from vical_daemon.logs.model import (
     PREFERENCE,
     ImuArrays,
@@ -56,6 +57,7 @@ _KIND_OF_TYPE: dict[str, Kind] = {
     TRACKS_TYPE: "tracks",
 }
 _STAMP = struct.Struct("<iI")
+_ZSTD = b"\x28\xb5\x2f\xfd"  # RFC 8878
 # Offsets of rates and forces from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
 _IMU_NUMBERS = 37 * 8
@@ -169,6 +171,8 @@ class LogRecording(Recording):
                 stamp_ns = None
             if stamp_ns is None or (not channel.stamps and not _readable(channel, raw.payload)):
                 channel.unreadable += 1
+                if raw.payload.startswith(_ZSTD):
+                    channel.problem = "each is packed by zstd: give the bag with its metadata.yaml"
                 continue
             if channel.kind == "imu":
                 channel.values += raw.payload[_GYRO]
@@ -210,7 +214,6 @@ class LogRecording(Recording):
                 self._statuses[raw.topic] = raw.topic.removeprefix("/")
             return None
         if parsed is not None:
-            self.rig = parsed.rig
             name, key = parsed.name, raw.topic.removeprefix("/")
         else:
             name = self._name(raw.topic, kind)
@@ -218,8 +221,19 @@ class LogRecording(Recording):
         if self._wanted is not None and not {raw.topic, raw.topic.removeprefix("/"), name} & self._wanted:
             self._others[raw.topic] = raw.type_name
             return None
+        if parsed is not None:
+            self._belongs_to(parsed.rig, kind, name)
         channel = self._channels[raw.topic] = _Channel(key, kind, name)
         return channel
+
+    def _belongs_to(self, rig: str, kind: Kind, name: str) -> None:
+        """Note the rig of a sensor; refuse a second one of its name, with which it would be mixed."""
+        if any(c.kind == kind and c.name == name for c in self._channels.values()):
+            raise RecordingError(
+                f"{self.path} holds {name} of two rigs, {self.rig} and {rig}: give the files of one, "
+                "or its topics"
+            )
+        self.rig = rig
 
     def _name(self, topic: str, kind: Kind) -> str:
         """Make a name of a foreign topic that no other of its kind has."""
@@ -424,9 +438,9 @@ class McapRecording(LogRecording):
     """One MCAP file, or a folder of the segments of one recording."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        for path in self._files():
+        for path, size in self._files:
             try:
-                reader = LogReader(path)
+                reader = LogReader(path, size)
                 for message in reader.messages():
                     channel = message.channel
                     if channel.encoding == "cdr":
@@ -440,7 +454,8 @@ class McapRecording(LogRecording):
             if not self._scanned:
                 self.warnings.extend(reader.warnings)
 
-    def _files(self) -> list[Path]:
-        if self.path.is_dir():
-            return sorted(self.path.glob("*.mcap"))
-        return [self.path]
+    @cached_property
+    def _files(self) -> list[tuple[Path, int]]:
+        """Files and their sizes when they were first read: a recorder may still write the last one."""
+        paths = segments_in(self.path) if self.path.is_dir() else [self.path]
+        return [(path, size_now(path)) for path in paths]

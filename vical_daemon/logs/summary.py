@@ -22,7 +22,7 @@ class TopicSummary:
     """One topic.
 
     Attributes:
-        topic: Topic or key.
+        topic: Topic; of an ASL folder the file.
         type_name: ROS 2 type, or kind of stream.
         count: Messages.
         rate_hz: One over the median interval of the stamps.
@@ -73,38 +73,51 @@ class _Tally:
     bytes: int = 0
 
 
-def summarise_log(path: Path) -> Summary:
-    """Summarise one MCAP file, every topic of it.
+def summarise_logs(path: Path, files: list[Path]) -> Summary:
+    """Summarise MCAP files of one recording, every topic of them.
+
+    Args:
+        path: As the user named the recording.
+        files: Its files, in their order.
 
     Raises:
-        LogError: It is no MCAP file.
+        LogError: One is no MCAP file.
     """
-    reader = LogReader(path)
     tallies: dict[str, _Tally] = {}
-    for message in reader.messages():
-        channel = message.channel
-        tally = tallies.get(channel.topic)
-        if tally is None:
-            tally = tallies[channel.topic] = _Tally(channel.type_name)
-        stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
-        # TFMessage and String do not start with a stamp
-        plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
-        tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
-        tally.arrivals.append(_fit(message.log_time_ns))
-        tally.bytes += len(message.payload)
-    metadata = {name: values for name, values in reader.metadata}  # noqa: C416
-    attachments = {item.name: len(item.data) for item in reader.attachments}
-    return _summary(path, tallies, list(reader.warnings), reader.complete, metadata, attachments)
+    readers = [LogReader(file) for file in files]
+    for reader in readers:
+        for message in reader.messages():
+            channel = message.channel
+            tally = tallies.get(channel.topic)
+            if tally is None:
+                tally = tallies[channel.topic] = _Tally(channel.type_name)
+            stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
+            # TFMessage and String do not start with a stamp
+            plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
+            tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
+            tally.arrivals.append(_fit(message.log_time_ns))
+            tally.bytes += len(message.payload)
+    metadata = {name: values for reader in readers for name, values in reader.metadata}
+    attachments = {item.name: len(item.data) for reader in readers for item in reader.attachments}
+    warnings = [warning for reader in readers for warning in reader.warnings]
+    complete = all(reader.complete for reader in readers)
+    return _summary(path, tallies, warnings, complete, metadata, attachments)
 
 
 def summarise_recording(recording: Recording) -> Summary:
     """Summarise any other recording: its sensors."""
-    tallies = {stream.key: _Tally(stream.kind) for stream in recording.streams}
+    topics = {stream.key: _source(recording.path, stream.source) for stream in recording.streams}
+    tallies = {topics[stream.key]: _Tally(stream.kind) for stream in recording.streams}
     for key, payload in recording.messages(recording.streams):
-        tally = tallies[key]
+        tally = tallies[topics[key]]
         tally.stamps.append(stamp_of(payload) or 0)
         tally.bytes += len(payload)
     return _summary(recording.path, tallies, list(recording.warnings), True, {}, {})
+
+
+def _source(recording: Path, source: str) -> str:
+    """Name a topic as the recording does, and a file by its place in the folder."""
+    return str(Path(source).relative_to(recording)) if Path(source).is_relative_to(recording) else source
 
 
 def _fit(value: int) -> int:

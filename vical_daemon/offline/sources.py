@@ -27,7 +27,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.topics import parse_key
 from vical_daemon.logs import RecordingError
 from vical_daemon.logs.bags import bag_messages
-from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.mcap import LogError, LogReader, segments_in
 from vical_daemon.logs.recorded_logs import RawMessage, name_of_topic
 from vical_daemon.offline.errors import InputError
 
@@ -90,7 +90,7 @@ def _from_log(path: Path) -> Rig:
 
 def _messages(path: Path) -> Iterator[RawMessage]:
     """Yield the messages of a log or bag as CDR; metadata of MCAP files come as messages without a type."""
-    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    files = segments_in(path) if path.is_dir() else [path]
     if path.suffix == ".bag" or (not files and (path / "metadata.yaml").is_file()):
         yield from bag_messages(path, _ROS_TYPES)
         return

@@ -22,14 +22,13 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.topics import CALIBRATION, COMMAND, STATUS, Topic, parse_key
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
-from vical_daemon.logs.mcap import Attachment, LogError, LogFolder, LogSession
+from vical_daemon.logs.mcap import Attachment, LogError, LogFolder, LogSession, describe
 from vical_daemon.record.images import ImageCompressor
 from vical_daemon.record.queue import Arrival, RecordQueue
 from vical_daemon.service.device_serials import DeviceSerials
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
-_NO_ROOM = "the disk has reached record.reserve_bytes; waiting for space"
 _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
 _KEYS = 512
@@ -45,6 +44,10 @@ class Recorder:
         self._images = ImageCompressor(config)
         self._wanted, self._why_off = config.record.enabled, "off: record.enabled is false"
         self._session: LogSession | None = None
+        reserve = f"{config.record.reserve_bytes / 1e6:.0f} MB"
+        self._no_room = (
+            f"the disk of {folder.path} has reached record.reserve_bytes ({reserve}); waiting for space"
+        )
         self._problem = ""
         self._retry_ns = 0
         self._command_key = COMMAND.key(config.rig, "record")
@@ -160,26 +163,35 @@ class Recorder:
         now_ns = self._clock.now_ns()
         try:
             if self._session is not None:
-                self._session.tick(now_ns)
-                self._folder.enforce_quota(self._session.segment_bytes)
-                if not self._folder.has_room():
-                    self._end(_NO_ROOM)
+                self._continue(self._session, now_ns)
             elif self._wanted and now_ns >= self._retry_ns:
                 self._retry_ns = now_ns + _RETRY_NS
                 self._begin(now_ns)
-        except (LogError, OSError) as error:
+        except LogError as error:
             self._fail(str(error))
+        except OSError as error:
+            self._fail(f"cannot record into {self._folder.path}: {describe(error)}")
+
+    def _continue(self, session: LogSession, now_ns: int) -> None:
+        if not self._folder.in_place():
+            self._retry_ns = now_ns  # nothing to wait for
+            self._end(f"{self._folder.path} was moved, deleted or replaced; going on in a new file")
+            return
+        session.tick(now_ns)
+        self._folder.enforce_quota(session.path, session.segment_bytes)
+        if not self._folder.has_room():
+            self._end(self._no_room)
 
     def _begin(self, now_ns: int) -> None:
         if not self._folder.lock():
             self._problem = f"standing by: another recorder writes into {self._folder.path}"
             return
         self._start_recovery()
-        self._folder.enforce_quota(0)
+        self._folder.enforce_quota()
         if not self._folder.has_room(resuming=bool(self._problem)):
-            if self._problem != _NO_ROOM:
-                _log.warning("not recording: %s", _NO_ROOM)
-            self._problem = _NO_ROOM
+            if self._problem != self._no_room:
+                _log.warning("not recording: %s", self._no_room)
+            self._problem = self._no_room
             return
         record = self._config.record
         self._session = LogSession(
@@ -211,7 +223,14 @@ class Recorder:
         if problem:
             _log.warning("%s", problem)
         if session is not None:
+            self._close(session)
+
+    def _close(self, session: LogSession) -> None:
+        try:
             session.close(self._clock.now_ns())
+        except LogError as error:
+            self._problem = str(error)
+            _log.error("%s", error)
 
     def _fail(self, problem: str) -> None:
         """Give up the segment (its part can be recovered) and retry later; log the same problem once."""
@@ -227,11 +246,7 @@ class Recorder:
 
     def close(self) -> None:
         """Finish the open segment and let another recorder take over; may be called twice."""
-        try:
-            self._end("")
-        except LogError as error:
-            self._problem = str(error)
-            _log.error("%s", error)
+        self._end("")
         if self._recovery is not None:
             self._recovery.join(_RECOVERY_S)
         if self._recovery is None or not self._recovery.is_alive():  # or two processes would recover one part

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART_SUFFIX = ".part"
@@ -26,11 +26,13 @@ class LockedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.error: OSError | None = None
-        self._fd = -1
+        self._fd = self._folder_fd = -1
         while self._fd < 0:  # a cleanup may remove it as a leftover before it is locked
             try:
+                self._folder_fd = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
                 self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             except OSError as error:
+                self.close()
                 raise LogError(f"cannot create {path}: {describe(error)}") from None
             fcntl.flock(self._fd, fcntl.LOCK_EX)
             if os.fstat(self._fd).st_nlink == 0:
@@ -67,11 +69,31 @@ class LockedFile:
         except OSError as error:
             self.error = self.error or error
 
+    def publish(self, name: str) -> None:
+        """Give the finished file its final name, never over an existing one, also if its folder was moved.
+
+        Raises:
+            LogError: The name is taken, or the file was deleted.
+        """
+        try:
+            os.stat(name, dir_fd=self._folder_fd)
+        except OSError:
+            pass
+        else:
+            raise LogError(f"{self.path.with_name(name)} exists already; remove it or choose another name")
+        try:
+            os.rename(self.path.name, name, src_dir_fd=self._folder_fd, dst_dir_fd=self._folder_fd)
+            os.fsync(self._folder_fd)
+        except OSError as error:
+            raise LogError(f"cannot finish {self.path}: {describe(error)}") from None
+
     def close(self) -> None:
         """Close the file and release the lock; may be called twice."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        descriptors, self._fd, self._folder_fd = (self._fd, self._folder_fd), -1, -1
+        for descriptor in descriptors:
+            if descriptor >= 0:
+                with suppress(OSError):  # a network disk: what was not written, `sync` has reported
+                    os.close(descriptor)
 
 
 def describe(error: OSError) -> str:

@@ -7,15 +7,17 @@ import os
 import re
 import secrets
 import shutil
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from vical_daemon.logs.mcap.files import LogError, describe
 from vical_daemon.logs.mcap.recover import Recovery, recover_folder
 
 _LOCK = ".recorder.lock"
 # Only files of this form are ever deleted: rig_YYYYmmddTHHMMSSZ_run_segment.mcap
-_OURS = re.compile(r"[A-Za-z]\w*_\d{8}T\d{6}Z_[0-9a-f]{6}_\d{4}(\.recovered)?\.mcap")
+_OURS = re.compile(r"[A-Za-z]\w*_(\d{8}T\d{6}Z)_([0-9a-f]{6})_(\d{4,})(\.recovered)?\.mcap")
 
 
 class LogFolder:
@@ -37,6 +39,8 @@ class LogFolder:
         self._quota_bytes = quota_bytes
         self._reserve_bytes = reserve_bytes
         self._lock_fd = -1
+        self._finished_bytes: int | None = None  # of all finished segments; None: not known
+        self._open_segment: Path | None = None
         self.deleted = 0
 
     @property
@@ -50,11 +54,12 @@ class LogFolder:
         Raises:
             LogError: The folder cannot be made or written.
         """
-        if self.locked:
+        if self.locked and self.in_place():
             return True
+        self.unlock()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            descriptor = _open_lock(self.path / _LOCK)
         except OSError as error:
             raise LogError(f"cannot record into {self.path}: {describe(error)}") from None
         try:
@@ -65,40 +70,65 @@ class LogFolder:
         self._lock_fd = descriptor
         return True
 
+    def in_place(self) -> bool:
+        """Whether the folder is still the one that was locked: not moved, deleted, or hidden by a mount."""
+        try:
+            here = (self.path / _LOCK).stat()
+        except OSError:
+            return False
+        return self.locked and os.path.samestat(here, os.fstat(self._lock_fd))
+
     def unlock(self) -> None:
         """Let another recorder take over; may be called twice."""
+        self._finished_bytes = None
         if self._lock_fd >= 0:
             os.close(self._lock_fd)
             self._lock_fd = -1
 
     def recover(self) -> list[Recovery]:
         """Recover the parts that a killed recorder left; call it with the lock held."""
-        return recover_folder(self.path)
+        done = recover_folder(self.path)
+        self._finished_bytes = None
+        return done
 
     def segments(self) -> list[Path]:
-        """Finished segments of vical, oldest first."""
-        dated = []
-        for path in self.path.glob("*.mcap"):
-            if _OURS.fullmatch(path.name):
-                try:
-                    dated.append((path.stat().st_mtime_ns, path.name, path))
-                except FileNotFoundError:
-                    continue
-        return [path for _, _, path in sorted(dated)]
+        """Finished segments of vical, oldest first.
 
-    def enforce_quota(self, open_bytes: int) -> list[Path]:
-        """Delete the oldest segments until all, with the open one, fit; returns what was deleted."""
+        Their age is that in their names. The time of a file would be that of its recovery or copy, and
+        it steps with the wall clock, which the names do not until the next boot.
+        """
+        dated: list[tuple[str, str, int, Path]] = []
+        oldest: dict[str, int] = {}
+        for path in self.path.glob("*.mcap"):
+            match = _OURS.fullmatch(path.name)
+            if match:
+                begin, run, segment, _ = match.groups()
+                dated.append((begin, run, int(segment), path))
+                oldest[run] = min(oldest.get(run, sys.maxsize), _about(path).mtime_ns)
+        # Runs of one second in the order of their files.
+        dated.sort(key=lambda item: (item[0], oldest[item[1]], *item[1:]))
+        return [path for *_, path in dated]
+
+    def enforce_quota(self, open_segment: Path | None = None, open_bytes: int = 0) -> list[Path]:
+        """Delete the oldest segments until all, with the open one, fit; returns what was deleted.
+
+        May be called often: the folder is read only when another segment is open, or the sum is too large.
+        """
         if not self._quota_bytes:
             return []
-        segments = self.segments()
-        sizes = {path: path.stat().st_size for path in segments}
-        total, deleted = sum(sizes.values()) + open_bytes, []
-        for path in segments:
-            if total <= self._quota_bytes:
+        if open_segment != self._open_segment:
+            self._finished_bytes, self._open_segment = None, open_segment
+        if self._finished_bytes is not None and self._finished_bytes + open_bytes <= self._quota_bytes:
+            return []
+        sizes = {path: _about(path).size for path in self.segments()}
+        total, deleted = sum(sizes.values()), []
+        for path in sizes:
+            if total + open_bytes <= self._quota_bytes:
                 break
             path.unlink(missing_ok=True)
             total -= sizes[path]
             deleted.append(path)
+        self._finished_bytes = total
         self.deleted += len(deleted)
         return deleted
 
@@ -108,13 +138,32 @@ class LogFolder:
 
     def has_room(self, *, resuming: bool = False) -> bool:
         """Whether the reserve is free; to resume, 10 % more must be free (hysteresis)."""
-        try:
-            return self.free_bytes() > self._reserve_bytes * (1.1 if resuming else 1.0)
-        except OSError:
-            return False
+        return self.free_bytes() > self._reserve_bytes * (1.1 if resuming else 1.0)
 
 
 def run_name(rig: str, unix_ns: int) -> str:
     """Return the first part of the segment names of one run; unique even if the clock is set back."""
     begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
     return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{secrets.token_hex(3)}"
+
+
+def _open_lock(path: Path) -> int:
+    """Open the lock file; for reading if another user (root, once) made it. Over NFS a lock needs writing."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except PermissionError:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+
+class _About(NamedTuple):
+    size: int
+    mtime_ns: int
+
+
+def _about(path: Path) -> _About:
+    """Return size and time of a file; zeros if somebody has just removed it."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return _About(0, 0)
+    return _About(found.st_size, found.st_mtime_ns)

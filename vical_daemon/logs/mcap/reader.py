@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from vical_drivers.user_files import open_file
 
 from vical_daemon.logs.mcap.chunks import Budget, SpentError, unpack_chunk
-from vical_daemon.logs.mcap.files import LogError, describe
+from vical_daemon.logs.mcap.files import PART_SUFFIX, LogError, describe
 
 MAGIC = b"\x89MCAP0\r\n"
 # What the parsers of the mcap package and of lz4 raise on damaged input.
@@ -66,6 +66,7 @@ class LogReader:
 
     Attributes:
         path: The file.
+        end: Read no further than this offset: of a file that grows, each pass sees the same.
         metadata: Metadata records seen so far, (name, values) in order.
         attachments: Attachments seen so far.
         warnings: What is wrong with the file, one line each; complete after `bus/messages` has ended.
@@ -74,6 +75,7 @@ class LogReader:
     """
 
     path: Path
+    end: int | None = None
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -90,7 +92,7 @@ class LogReader:
             LogError: It cannot be read, or is not an MCAP file.
         """
         try:
-            with open_file(self.path) as file:
+            with open_now(self.path) as file:
                 head = file.read(len(MAGIC))
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
@@ -116,8 +118,9 @@ class LogReader:
         self._restart()
         stopped = False
         try:
-            with open_file(self.path) as file:
+            with open_now(self.path) as file:
                 size = os.fstat(file.fileno()).st_size
+                size = size if self.end is None else min(size, self.end)
                 self._budget = Budget(size)
                 self._learn_from_summary(file, size)
                 file.seek(len(MAGIC))
@@ -145,7 +148,7 @@ class LogReader:
     def _learn_from_summary(self, file: BinaryIO, size: int) -> None:
         """Read the topics from the summary at the end too, as their chunk may be damaged."""
         file.seek(max(0, size - _END.size))
-        tail = file.read()
+        tail = file.read(_END.size)
         if len(tail) < _END.size or not tail.endswith(MAGIC):
             return
         opcode, length, begin, _, _, _ = _END.unpack(tail)
@@ -162,7 +165,7 @@ class LogReader:
     def _read_data(self, file: BinaryIO, size: int) -> Iterator[LogMessage]:
         while True:
             head = file.read(_LENGTH.size)
-            if len(head) < _LENGTH.size:
+            if len(head) < _LENGTH.size or file.tell() > size:
                 return
             opcode, length = _LENGTH.unpack(head)
             if opcode == Opcode.DATA_END:
@@ -170,7 +173,7 @@ class LogReader:
                 return
             if length > size - file.tell():
                 if opcode == Opcode.CHUNK:
-                    yield from self._read_open_chunk(file.read(_RECORD_LIMIT))
+                    yield from self._read_open_chunk(file.read(min(size - file.tell(), _RECORD_LIMIT)))
                 return
             self._budget.spend(0)
             if length > _RECORD_LIMIT:
@@ -254,3 +257,45 @@ class LogReader:
         name, encoding = (known.name, known.encoding) if known else ("", "")
         text = known.data.decode("utf-8", "replace") if known else ""
         self._channels[channel.id] = LogChannel(channel.topic, name, channel.message_encoding, text, encoding)
+
+
+def open_now(path: Path) -> BinaryIO:
+    """Open a file; a part that its recorder has finished meanwhile, under its final name.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    try:
+        return open_file(path)
+    except FileNotFoundError:
+        finished = path.with_suffix("")
+        if path.suffix != PART_SUFFIX or not finished.exists():
+            raise
+        return open_file(finished)
+
+
+def size_now(path: Path) -> int:
+    """Return the size of a file as `open_now` opens it; 0: it is gone, or another kind of file."""
+    try:
+        with open_now(path) as file:
+            return os.fstat(file.fileno()).st_size
+    except OSError:
+        return 0
+
+
+def segments_in(folder: Path) -> list[Path]:
+    """Return the MCAP files of a folder in the order of their first messages, also an unfinished one.
+
+    Names do not tell the order: ROS 2 calls the segments of a bag _0, _1, ... _10.
+    """
+    parts = list(folder.glob(f"*.mcap{PART_SUFFIX}"))  # first: one that is finished now is then found twice
+    finished = list(folder.glob("*.mcap"))
+    begun = [part for part in parts if part.with_suffix("") not in finished and size_now(part)]
+    return sorted(finished + begun, key=lambda path: (_begin_ns(path), path.name))
+
+
+def _begin_ns(path: Path) -> int:
+    try:
+        return next((message.log_time_ns for message in LogReader(path).messages()), 0)
+    except LogError:
+        return 0  # whoever reads it reports the error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,9 +69,11 @@ def recover(source: Path, output: Path | None = None, *, even_empty: bool = Fals
             raise LogError(f"{source}: not one whole message in its {source.stat().st_size} bytes")
         publish(temporary, output)
     except OSError as error:
-        raise LogError(f"cannot write {temporary}: {describe(error)}") from None
+        problem = f"cannot write {temporary}: {describe(error)}"
+        raise LogError(f"{problem}; write it elsewhere with -o") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a disk that is read-only would hide the error
+            temporary.unlink(missing_ok=True)
     return Recovery(source, output, count, tuple(reader.warnings))
 
 

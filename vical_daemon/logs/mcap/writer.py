@@ -12,7 +12,7 @@ from vical_drivers.closing import Closing
 
 from vical_daemon.bus.messages import ros2_schema
 from vical_daemon.bus.topics import parse_key
-from vical_daemon.logs.mcap.files import PART_SUFFIX, LockedFile, LogError, describe, publish
+from vical_daemon.logs.mcap.files import PART_SUFFIX, LockedFile, LogError, describe
 
 CHUNK_BYTES = 1_048_576
 _ROS_TOPIC = re.compile(r"/[A-Za-z0-9_/]+")
@@ -167,6 +167,6 @@ class LogWriter(Closing):
         try:
             if self._file.error is not None:
                 self._raise()
-            publish(self.part_path, self.path)
+            self._file.publish(self.path.name)
         finally:
             self._file.close()

@@ -95,12 +95,12 @@ def _variance(covariance: Any) -> float:
 def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
     """Yield (topic, type, function that decodes) of all messages of any log of ROS messages."""
     from vical_daemon.bus.messages.schemas import typestore
-    from vical_daemon.logs.mcap import LogError, LogReader
+    from vical_daemon.logs.mcap import LogError, LogReader, segments_in
 
     store = typestore()
     folder = path.is_dir() and not (path / "metadata.yaml").is_file()
     if folder or (path.suffix != ".bag" and path.is_file() and path.suffix != ".db3"):
-        files = sorted(path.glob("*.mcap")) if folder else [path]
+        files = segments_in(path) if folder else [path]
         if not files:
             raise InputError(f"{path} is no log of messages: topics need an MCAP or a bag")
         try:

@@ -23,6 +23,7 @@ class Scene {
     canvas.addEventListener("pointermove", (e) => this.drag(e));
     for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (e) => this.fingers.delete(e.pointerId));
     canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.nearer(Math.exp(-e.deltaY / 500)); }, { passive: false });
+    canvas.addEventListener("keydown", (e) => this.key(e));
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
@@ -42,6 +43,20 @@ class Scene {
     this.draw();
   }
 
+  key(e) {
+    const [yaw, pitch] = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key] || [0, 0];
+    const factor = { "+": 1.25, "=": 1.25, "-": 0.8 }[e.key];
+    if (e.ctrlKey || e.metaKey || e.altKey || !(yaw || pitch || factor)) return; // Ctrl and + is the browser's
+    e.preventDefault();
+    this.turnBy(yaw, pitch);
+    this.nearer(factor || 1);
+  }
+
+  turnBy(yaw, pitch) {
+    this.turn.yaw += yaw;
+    this.turn.pitch = Math.min(Math.max(this.turn.pitch + pitch, -1.6), 1.6);
+  }
+
   drag(e) {
     const last = this.fingers.get(e.pointerId);
     if (!last) return;
@@ -50,8 +65,7 @@ class Scene {
       const gap = (f) => Math.hypot(f.clientX - others[0].clientX, f.clientY - others[0].clientY);
       this.zoom *= gap(e) / Math.max(gap(last), 1);
     } else {
-      this.turn.yaw += (e.clientX - last.clientX) / 120;
-      this.turn.pitch = Math.min(Math.max(this.turn.pitch + (e.clientY - last.clientY) / 120, -1.6), 1.6);
+      this.turnBy((e.clientX - last.clientX) / 120, (e.clientY - last.clientY) / 120);
     }
     this.fingers.set(e.pointerId, e);
     this.draw();
@@ -198,11 +212,17 @@ class Scene {
     c.stroke();
     c.font = "12px system-ui, sans-serif";
     c.fillText(unit, 12, y - 6);
-    const text = `ellipsoids: 1 sigma${this.gain > 1 ? ` × ${this.gain}` : ", to scale"} (largest ${(1e3 * worst).toPrecision(2)} mm)`;
+    const lines = [`ellipsoids: 1 sigma${this.gain > 1 ? ` × ${this.gain}` : ", to scale"}`, `(largest ${(1e3 * worst).toPrecision(2)} mm)`];
+    const whole = lines.join(" "), narrow = c.measureText(whole).width > box.width - 16;
     c.textAlign = "right";
-    c.fillText(text, box.width - 8, 16);
+    (narrow ? lines : [whole]).forEach((text, i) => c.fillText(text, box.width - 8, 16 + 15 * i));
     c.textAlign = "left";
   }
+}
+
+function press(button, on) { // a button that stays down
+  button.classList.toggle("on", on);
+  button.setAttribute("aria-pressed", String(on));
 }
 
 // Buttons of a view: data-room="1|0" and data-gain="N" inside the element that holds the canvas.
@@ -211,7 +231,8 @@ function sceneButtons(scene, holder) {
     button.onclick = () => {
       const kind = "room" in button.dataset ? "room" : "gain";
       scene.choose({ [kind]: kind === "room" ? button.dataset.room === "1" : Number(button.dataset.gain) });
-      for (const other of holder.querySelectorAll(`button[data-${kind}]`)) other.classList.toggle("on", other === button);
+      for (const other of holder.querySelectorAll(`button[data-${kind}]`)) press(other, other === button);
     };
+    press(button, button.classList.contains("on"));
   }
 }

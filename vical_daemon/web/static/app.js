@@ -4,6 +4,7 @@
 const $ = (id) => document.getElementById(id);
 const page = { columns: [], rows: {}, latest: {}, devices: [], sights: {}, paths: {}, views: [], fault: null, control: false, camera: null, span: 0, heard: 0 };
 const SILENT_MS = 5000; // the robot speaks 2.5 times a second
+const AGAIN_MS = 3000;
 const AXES = ["x", "y", "z"];
 const COLOURS = ["--x", "--y", "--z"];
 
@@ -142,6 +143,8 @@ function drawWords() {
   const headline = latest ? latest.headline : "No estimate yet: the calibrate process is starting, or it does not run.";
   setText("headline", fault ? fault.headline : headline);
   setText("guidance", fault ? fault.message : latest ? latest.guidance : "");
+  // Spoken when it changes; the pill changes with every second or per cent.
+  setText("spoken", fault ? `${fault.headline} ${fault.message}` : [status, latest ? latest.guidance : ""].filter(Boolean).join(": "));
   setText("reason", fault ? `Calibration: ${headline}` : latest ? latest.reason : "");
   $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
   setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 1 sigma` : "");
@@ -173,6 +176,8 @@ function drawDevices() {
     const line = element("tr");
     const dot = element("span", `dot l${d.level}`);
     dot.title = ["ok", "warning", "error", "stale"][d.level];
+    dot.setAttribute("role", "img");
+    dot.setAttribute("aria-label", dot.title);
     const first = element("td");
     first.append(dot);
     const lost = d.values.lost !== undefined ? d.values.lost : d.values.dropped;
@@ -197,10 +202,17 @@ function drawTabs() {
   $("tabs").replaceChildren(...(names.length > 1 ? names.map((name) => {
     const button = element("button", "", name);
     button.setAttribute("role", "tab");
-    button.setAttribute("aria-selected", String(name === page.camera));
     button.onclick = () => { choose(name); draw(); };
     return button;
   }) : []));
+  selectTab();
+}
+
+function selectTab() {
+  for (const tab of $("tabs").children) {
+    tab.setAttribute("aria-selected", String(tab.textContent === page.camera));
+    tab.tabIndex = tab.textContent === page.camera ? 0 : -1;
+  }
 }
 
 const PATH = 60; // poses kept: 24 s
@@ -234,7 +246,7 @@ function drawSight() {
 
 function choose(name) {
   page.camera = name;
-  for (const tab of $("tabs").children) tab.setAttribute("aria-selected", String(tab.textContent === name));
+  selectTab();
   if (page.views.includes(name)) camera.look(name);
 }
 
@@ -283,26 +295,41 @@ function take(message, full) {
 }
 
 function listen() {
-  const source = new EventSource("events");
+  const source = page.source = new EventSource("events");
   source.addEventListener("full", (event) => take(JSON.parse(event.data), true));
   source.addEventListener("update", (event) => take(JSON.parse(event.data), false));
   source.onopen = () => {
     $("link").classList.add("on");
     setText("link", "live");
   };
-  source.onerror = () => { $("link").classList.remove("on"); setText("link", "offline, trying again"); };
-  // A page that the browser keeps for its back button would keep its connections, of which there are six a host.
-  window.addEventListener("pagehide", () => { source.close(); camera.source?.close(); });
-  window.addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
+  source.onerror = () => { $("link").classList.remove("on"); setText("link", "offline, trying again"); again(source, listen); };
 }
+
+// The browser connects again by itself, but not after an answer like 502 of a proxy while the robot restarts.
+function again(source, connect) {
+  if (source.readyState === EventSource.CLOSED) setTimeout(connect, AGAIN_MS);
+}
+
+// A page that the browser keeps for its back button would keep its connections, of which there are six a host.
+window.addEventListener("pagehide", () => { page.source?.close(); camera.source?.close(); });
+window.addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
 
 for (const button of document.querySelectorAll(".range button")) {
   button.onclick = () => {
     page.span = Number(button.dataset.span);
-    for (const other of document.querySelectorAll(".range button")) other.classList.toggle("on", other === button);
+    for (const other of document.querySelectorAll(".range button")) press(other, other === button);
     drawCharts();
   };
+  press(button, button.classList.contains("on"));
 }
+
+$("tabs").onkeydown = (event) => { // one tab stop; arrows change the camera
+  const tabs = [...$("tabs").children], step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (!step || !tabs.length) return;
+  const next = tabs[(tabs.indexOf(document.activeElement) + step + tabs.length) % tabs.length];
+  next.click();
+  next.focus();
+};
 
 window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawCharts(); scene.draw(); });
 setInterval(watchSilence, 1000);

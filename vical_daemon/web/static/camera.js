@@ -16,16 +16,24 @@ class CameraScreen {
     for (const id of ["show-detected", "show-predicted", "show-coverage"]) this.byId(id).onchange = () => this.draw();
   }
 
-  look(name) { // the browser connects again by itself when the robot was away
+  look(name) {
     if (name === this.name) return;
     this.name = name;
+    this.connect();
+  }
+
+  connect() {
+    const name = this.name;
     if (this.source) this.source.close();
     this.source = new EventSource(`camera/${encodeURIComponent(name)}/events`);
     this.source.addEventListener("picture", (event) => {
       this.number += 1;
       this.show(Object.assign(JSON.parse(event.data), { number: this.number }));
     });
-    this.source.onerror = () => document.querySelector(".screen").classList.remove("live");
+    this.source.onerror = (event) => {
+      document.querySelector(".screen").classList.remove("live");
+      again(event.target, () => { if (this.source === event.target) this.connect(); });
+    };
   }
 
   async show(picture) {
@@ -88,7 +96,7 @@ class CameraScreen {
     setText("wanted", wanted ? wanted.text : "");
   }
 
-  // Green where corners have been and fit, orange where they fit worse, dark where there were none.
+  // Green where corners have been and fit, yellow where there were few, red where they fit worse, dark where none were.
   cells(width, height) {
     const c = this.coverage;
     if (!c || !this.byId("show-coverage").checked) return [];

@@ -49,6 +49,8 @@ async function download(path) {
 }
 
 $("token").value = sessionStorage.getItem("token") || "";
+// Enter would press the first button: accept.
+$("token").onkeydown = (event) => { if (event.key === "Enter") event.preventDefault(); };
 $("format").replaceChildren(...FORMATS.map((name) => element("option", "", name)));
 $("export").onclick = () => download(`api/export/${$("format").value}`);
 $("log").onclick = () => download("api/log");

@@ -1,0 +1,78 @@
+"""Tables as spreadsheets and archives leave them, and folders that hold more than one recording."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+from pathlib import Path
+
+import pytest
+
+from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.recorded_logs import stamp_of
+
+
+@pytest.fixture
+def folder(asl_folder, tmp_path) -> Path:
+    """A copy that a test may change."""
+    return shutil.copytree(asl_folder, tmp_path / "asl")
+
+
+def tables(folder: Path) -> list[Path]:
+    return [folder / "mav0" / "imu0" / "data.csv", folder / "mav0" / "cam0" / "corners.csv"]
+
+
+def messages(folder: Path) -> list[tuple[str, bytes]]:
+    return list(open_recording(folder).messages())
+
+
+def test_packed_tables_are_read_like_others(folder):
+    before = messages(folder)
+    for path in tables(folder):
+        path.with_name(path.name + ".gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    assert messages(folder) == before
+
+
+def test_quoted_cells_are_numbers(folder):
+    before = messages(folder)
+    for path in tables(folder):
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in lines))
+    assert messages(folder) == before
+
+
+def test_decimal_commas_are_named(folder):
+    """Each number would be read as two: the accelerometer read 1e16 m/s^2."""
+    for path in tables(folder):
+        title, *rows = path.read_text().splitlines()
+        path.write_text("\n".join([title, *(row.replace(".", ",") for row in rows)]))
+    with pytest.raises(RecordingError, match="more columns than its title: write decimal points, not commas"):
+        open_recording(folder)
+
+
+def test_a_recording_without_its_imu_says_what_was_found(folder):
+    tables(folder)[0].unlink()
+    with pytest.raises(RecordingError, match=r"holds no IMU data: found only .*corners\.csv"):
+        open_recording(folder)
+
+
+def test_files_of_two_rigs_are_not_mixed(asl_folder, tmp_path):
+    for rig in ("rover", "drone"):
+        with LogWriter(tmp_path / f"{rig}.mcap") as writer:
+            for key, payload in open_recording(asl_folder).messages():
+                writer.write(key.replace("rig0", rig), payload, stamp_of(payload))
+    with pytest.raises(RecordingError, match=r"holds imu0 of two rigs, \w+ and \w+: give the files of one"):
+        open_recording(tmp_path)
+    topics = ["vical/rover/imu/imu0", "vical/rover/camera/cam0/points"]
+    assert open_recording(tmp_path, topics=topics).rig == "rover"
+
+
+def test_a_copy_in_the_folder_is_named(asl_folder, tmp_path):
+    for name in ("a", "copy of a"):
+        with LogWriter(tmp_path / f"{name}.mcap") as writer:
+            for key, payload in open_recording(asl_folder).messages():
+                writer.write(key, payload, stamp_of(payload))
+    with pytest.raises(RecordingError, match="is one of the files a copy of another"):
+        open_recording(tmp_path)

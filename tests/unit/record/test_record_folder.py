@@ -1,0 +1,152 @@
+"""The recorder's folder: moved, deleted or replaced while recording, and the quota over many segments."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.config.model import loads
+from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.record.queue import RecordQueue, arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import private_clock
+
+IMU = topics.IMU.key("rig0", "imu0")
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    config = loads(f"rig: rig0\nrecord: {{directory: {tmp_path / 'log'}, reserve_bytes: 0}}\n")
+    recorder = Recorder(config, LogFolder(tmp_path / "log"), private_clock())
+    recorder.tick()
+    yield recorder
+    recorder.close()
+
+
+def feed(recorder: Recorder, begin: int, count: int) -> None:
+    for i in range(begin, begin + count):
+        payload = m.encode_imu(1, "imu0", (float(i), 0.0, 0.0), (0.0, 0.0, 9.8))
+        recorder.write(arrival(Sample(IMU, payload, i), private_clock()))
+
+
+def kept(folder: Path) -> list[int]:
+    paths = LogFolder(folder).segments()
+    return sorted(
+        int(m.decode_imu(message.payload).gyro_rps[0])
+        for path in paths
+        for message in LogReader(path).messages()
+        if message.channel.topic == "/" + IMU
+    )
+
+
+def numbered(folder: Path, index: int, size: int = 10) -> Path:
+    path = folder / f"rig0_20261121T022842Z_ab12cd_{index:04d}.mcap"
+    path.write_bytes(b"x" * size)
+    return path
+
+
+@pytest.mark.parametrize("made_anew", [False, True])
+def test_a_folder_that_was_moved_keeps_its_segment_and_the_recording_goes_on(
+    recorder, tmp_path, caplog, made_anew
+):
+    feed(recorder, 0, 5)
+    (tmp_path / "log").rename(tmp_path / "moved")
+    if made_anew:
+        (tmp_path / "log").mkdir()
+    recorder.tick()
+    assert "moved, deleted or replaced" in recorder.status(RecordQueue(), 0).message
+    recorder.tick()
+    feed(recorder, 5, 5)
+    assert recorder.status(RecordQueue(), 0).level == m.Level.OK
+    recorder.close()
+    assert kept(tmp_path / "moved") == [0, 1, 2, 3, 4]
+    assert kept(tmp_path / "log") == [5, 6, 7, 8, 9]
+    assert [r.levelname for r in caplog.records if r.levelno > 20] == ["WARNING"]
+
+
+def test_a_deleted_folder_is_made_again(recorder, tmp_path):
+    feed(recorder, 0, 5)
+    shutil.rmtree(tmp_path / "log")
+    recorder.tick()
+    recorder.tick()
+    feed(recorder, 5, 5)
+    recorder.close()
+    assert kept(tmp_path / "log") == [5, 6, 7, 8, 9]
+
+
+def test_stop_after_the_folder_was_deleted_is_one_line(recorder, tmp_path, caplog):
+    feed(recorder, 0, 5)
+    shutil.rmtree(tmp_path / "log")
+    recorder.close()
+    (line,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert line.startswith("cannot finish ") and "No such file or directory" in line
+
+
+def test_quota_counts_segments_beyond_the_ten_thousandth(tmp_path):
+    """A recorder with `rotate_s: 300` gets there in 35 days."""
+    paths = [numbered(tmp_path, index) for index in (9998, 9999, 10000, 10001)]
+    folder = LogFolder(tmp_path, quota_bytes=20)
+    assert folder.segments() == paths
+    assert folder.enforce_quota() == paths[:2]
+
+
+def test_quota_takes_the_age_from_the_names(tmp_path):
+    """Recovered late, copied, or written after the wall clock was set back: the file's time is another."""
+    paths = [numbered(tmp_path, index) for index in range(3)]
+    for age, path in enumerate(paths):
+        os.utime(path, (1e9 - age, 1e9 - age))
+    assert LogFolder(tmp_path, quota_bytes=20).enforce_quota() == paths[:1]
+
+
+def test_quota_reads_the_folder_once_a_segment(tmp_path, monkeypatch):
+    """The recorder asks ten times a second: with 400 segments that took 13 % of a core."""
+    reads = []
+    segments = LogFolder.segments
+    monkeypatch.setattr(LogFolder, "segments", lambda folder: reads.append(1) or segments(folder))
+    for index in range(3):
+        numbered(tmp_path, index)
+    folder = LogFolder(tmp_path, quota_bytes=100)
+    for size in range(40):
+        assert not folder.enforce_quota(tmp_path / "open", size)
+    assert len(reads) == 1
+    numbered(tmp_path, 3)
+    assert not folder.enforce_quota(tmp_path / "next", 40)
+    assert [path.name[-9:-5] for path in folder.enforce_quota(tmp_path / "next", 70)] == ["0000"]
+    assert [path.name[-9:-5] for path in folder.enforce_quota(tmp_path / "next", 85)] == ["0001", "0002"]
+
+
+def test_a_lock_file_that_root_made_is_no_obstacle(tmp_path, monkeypatch):
+    """`sudo vical run record`, once, and the service could no longer record."""
+    really_open = os.open
+
+    def open_as_other_user(path, flags, *mode, **more):
+        if Path(path).name == ".recorder.lock" and flags & os.O_RDWR:
+            raise PermissionError(13, "Permission denied", str(path))
+        return really_open(path, flags, *mode, **more)
+
+    (tmp_path / ".recorder.lock").touch()
+    monkeypatch.setattr(os, "open", open_as_other_user)
+    first, second = LogFolder(tmp_path), LogFolder(tmp_path)
+    assert first.lock() and not second.lock()
+    first.unlock()
+    assert second.lock()
+    second.unlock()
+
+
+def test_runs_of_one_second_are_in_the_order_of_their_files(tmp_path):
+    """Their marks are random: a recorder that takes over at once may have the smaller one."""
+    paths = [
+        tmp_path / f"rig0_20261121T022842Z_{mark}_{index:04d}.mcap"
+        for mark in ("ffffff", "000000")
+        for index in (0, 1)
+    ]
+    for age, path in enumerate(paths):
+        path.write_bytes(b"x")
+        os.utime(path, (1e9 + age, 1e9 + age))
+    assert LogFolder(tmp_path).segments() == paths
