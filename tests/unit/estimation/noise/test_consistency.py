@@ -127,7 +127,7 @@ def lasting(seed, lasts_s, seconds, rate_hz=20.0):
 
 
 def test_the_factor_of_the_first_seconds_is_that_of_many():
-    """Errors that last for seconds look shorter in sums over less than a second; they may even last longer."""
+    """Errors that last for seconds look shorter in sums over under a second; they might last even longer."""
     early, late = np.transpose([lasting(seed, lasts_s=2.0, seconds=40.0) for seed in range(20)])
     assert late.mean() == pytest.approx(1.0 + 0.5 * 59 * 0.65, rel=0.2)  # 0.65: mean correlation within 3 s
     assert 0.9 < early.mean() / late.mean() < 1.5
