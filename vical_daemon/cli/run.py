@@ -6,6 +6,7 @@ import argparse
 import gc
 import logging
 import os
+import re
 import sys
 import threading
 import time
@@ -77,13 +78,18 @@ def _claims(config: Config, roles: list[str], stop: threading.Event) -> Claims:
 
     cameras = list(config.cameras)
     devices = {"imu": list(config.imus), "camera": cameras, "detect": cameras, "estimate": cameras}
-    names = [f"{config.rig}.{role}.{device}" for role in roles for device in devices.get(role, [])]
+    bus = "" if config.bus.socket is None else re.sub(r"\W+", ".", config.bus.socket)  # may share a folder
+    names = {
+        f"{config.rig}.{role}.{device}{bus}": (role, device)
+        for role in roles
+        for device in devices.get(role, [])
+    }
     try:
         return Claims(make_private(runtime_directory()), names, _CLAIM_S, stop)
     except ClaimedError as error:
-        rig, role, device = str(error).split(".")
+        role, device = names[str(error)]
         raise CliError(
-            f"another process already runs the role {role} for {device} of {rig}; stop it first "
+            f"another process already runs the role {role} for {device} of {config.rig}; stop it first "
             "(systemctl status 'vical-*')"
         ) from None
 

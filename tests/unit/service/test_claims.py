@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -40,6 +41,12 @@ def test_a_second_estimator_of_a_camera_is_refused_in_one_line():
         for _ in range(2):
             claims("record", "web")  # one stands by, the other wants a port of its own
     with claims("estimate"):
+        pass
+
+
+def test_two_buses_with_rigs_of_one_name_do_not_hinder_each_other():
+    other = replace(CONFIG, bus=replace(CONFIG.bus, socket="/run/other/zenoh.sock"))
+    with claims("estimate"), run._claims(other, ["estimate"], threading.Event()):
         pass
 
 
