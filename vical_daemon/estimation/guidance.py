@@ -6,7 +6,7 @@ z along the optical axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -54,7 +54,7 @@ class Guidance:
         turned_about: The one axis about which the rig turned so far, unit length, 3 numbers; empty: not
             known, or it turned about several.
         rate_rps: How fast it turns, RMS, rad/s; None: no matter.
-        camera: Whose image, for `SHOW`.
+        camera: Whose image, for `SHOW`; whose axes, if there are several cameras.
         edges: Which edges of that image have not seen the target.
     """
 
@@ -101,3 +101,8 @@ class WeakDirection:
     def excess(self) -> float:
         """Its sigma over the limit."""
         return self.sigma / self.limit
+
+
+def of_camera(weak: WeakDirection, camera: str) -> WeakDirection:
+    """The same direction, with the name of the camera whose axes it is about: one of several."""
+    return replace(weak, guidance=replace(weak.guidance, camera=camera))

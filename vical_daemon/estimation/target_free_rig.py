@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, ImuEstimate, Status
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
+from vical_daemon.estimation.wording import guidance_text
 
 # What the rig as a whole is: the first of these that any camera is.
 _ORDER = (
@@ -128,6 +129,10 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
     all_ = list(estimates.values())
     status = min((e.status for e in all_), key=_ORDER.index)
     behind = {name: e for name, e in estimates.items() if e.status == status}
+    asked = ((name, e.next_motion) for name, e in behind.items() if e.next_motion)
+    camera, next_motion = next(asked, ("", Guidance()))
+    if len(estimates) > 1:
+        next_motion = replace(next_motion, camera=camera)
     longest = max(all_, key=lambda e: e.imu_samples)
     frames = np.array([max(e.frames, 1) for e in all_], np.float64)
     return CalibrationEstimate(
@@ -135,7 +140,7 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
         status=status,
         reason="; ".join(f"{name}: {e.reason}" for name, e in behind.items() if e.reason),
         progress=min(e.progress for e in all_),
-        guidance=next((e.guidance for e in behind.values() if e.guidance), ""),
+        guidance=guidance_text(next_motion),
         duration_s=max(e.duration_s for e in all_),
         frames=sum(e.frames for e in all_),
         imu_samples=longest.imu_samples,
@@ -145,7 +150,7 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
         nis_per_dof=float(np.average([e.nis_per_dof for e in all_], weights=frames)),
         rejected_fraction=float(np.average([e.rejected_fraction for e in all_], weights=frames)),
         events=_events(estimates),
-        next_motion=next((e.next_motion for e in behind.values() if e.next_motion), Guidance()),
+        next_motion=next_motion,
         reading_hashes=longest.reading_hashes,
     )
 

@@ -1,7 +1,6 @@
 """The one place where events, guidance and weak directions become English text.
 
-For terminal, page, report, journal, and the text fields of messages and JSON. Nothing reads these texts back:
-whoever needs the facts takes them from the data (`events`, `guidance`).
+For terminal, page, report, journal, and the text fields of messages and JSON. Nothing reads these texts back.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, 
 
 ALONG = 0.85
 """Cosine above which a direction is called by the name of an axis: within 32 deg."""
-_BESIDE = 0.3
-"""Least share of a second axis in a direction that is called a line between two."""
+_BESIDE = 0.3  # least share of a second axis in a direction that is called a line between two
 _AXIS_NAMES = dict(zip(AXES, ("the image's x axis", "the image's y axis", "the optical axis"), strict=True))
 _TURNS = {"x": "the image's x axis (nod)", "y": "the image's y axis (shake)", "z": "the optical axis (roll)"}
 
@@ -52,7 +50,7 @@ def direction_sigma(weak: WeakDirection) -> str:
         Block.ROTATION: f"{math.degrees(weak.sigma):.2f} deg",
         Block.TIMESHIFT: f"{1e3 * weak.sigma:.2f} ms",
     }[weak.block]
-    return f"{direction_name(weak)}: ±{figure}"
+    return f"{direction_name(weak)}{_whose(weak.guidance)}: ±{figure}"
 
 
 def direction_warning(weak: WeakDirection) -> str:
@@ -75,14 +73,14 @@ def guidance_text(guidance: Guidance) -> str:
         return said(guidance)
     if guidance.verb is Verb.TURN_AND_MOVE:
         return "turn the rig about all three axes while moving it to and fro"
-    return "rotate " + " and ".join(f"about {_TURNS[axis]}" for axis in guidance.axes)
+    return "rotate " + " and ".join(f"about {_TURNS[axis]}" for axis in guidance.axes) + _whose(guidance)
 
 
 def guidance_caption(guidance: Guidance) -> str:
     """Say what the picture of the axes shows, in a few words; empty where nothing is missing."""
     if guidance.verb is Verb.SHOW:
         return f"show the target near the {_edges(guidance)} of the image"
-    axes = _listed(guidance.axes)
+    axes = _listed(guidance.axes) + _whose(guidance)
     return {
         Verb.NONE: "",
         Verb.TURN: f"turn about {axes}",
@@ -170,7 +168,7 @@ def _slow(guidance: Guidance) -> str:
 
 def _one_axis(guidance: Guidance) -> str:
     faster = ", and faster" if guidance.verb is Verb.TURN_FASTER else ""
-    about = axis_name(guidance.turned_about) if guidance.turned_about else "one axis"
+    about = axis_name(guidance.turned_about) + _whose(guidance) if guidance.turned_about else "one axis"
     return f"so far it turned about {about} only; rotate about another axis{faster}"
 
 
@@ -179,6 +177,10 @@ def _unseen_edges(guidance: Guidance) -> str:
         f"no corners yet near the {_edges(guidance)} of {guidance.camera}'s picture: "
         "show the target there, for the lens"
     )
+
+
+def _whose(guidance: Guidance) -> str:
+    return f" of {guidance.camera}" if guidance.camera else ""
 
 
 def _edges(guidance: Guidance) -> str:

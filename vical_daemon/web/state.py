@@ -369,11 +369,12 @@ def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False
     status, last_status = STALE if stale else str(estimate.status), str(estimate.status)
     quiet = fault or stale
     asked = Guidance() if quiet else estimate.next_motion
-    # of the edges of another camera's picture only the text speaks
+    # of the edges of another camera's picture, and of its axes, only the text speaks
     elsewhere = estimate.next_motion.camera not in ("", message.camera)
     own = Guidance() if elsewhere else estimate.next_motion
-    moves = asked.verb is Verb.TURN_AND_MOVE
-    turns = asked.verb not in (Verb.NONE, Verb.SHOW)
+    shown = Guidance() if quiet else own
+    moves = shown.verb is Verb.TURN_AND_MOVE
+    turns = shown.verb not in (Verb.NONE, Verb.SHOW)
     return {
         "status": status,
         "last_status": last_status,
@@ -390,9 +391,9 @@ def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False
         "rejected": finite(estimate.rejected_fraction),
         "withheld": withheld,
         "motion": {
-            "rotate": list(asked.axes) if turns else [],
-            "translate": list(asked.axes) if moves else [],
-            "edges": [] if quiet else list(own.edges),
+            "rotate": list(shown.axes) if turns else [],
+            "translate": list(shown.axes) if moves else [],
+            "edges": list(shown.edges),
             "caption": "" if quiet else motion_caption(status, asked, estimate.guidance),
         },
         "gravity": [finite(v) for v in estimate.gravity_world_mps2],

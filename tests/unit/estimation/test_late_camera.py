@@ -11,7 +11,12 @@ from vical_mocks.rig import reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.init.late_camera import LateCameras
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    ConvergenceTargets,
+    PointsFrame,
+)
 from vical_daemon.estimation.result import Status
 
 SEED, LENGTH_S, RATE_HZ = 1, 24.0, 10.0
@@ -34,14 +39,15 @@ def runs():
     }
 
 
-def calibrate(runs, seen, renumber=None, alike=False, silent=(), blank=False):
+def calibrate(runs, seen, renumber=None, alike=False, silent=(), blank=False, targets=None):
     """Feed both cameras where `seen(name, seconds)`; cam1 numbers by `renumber`. Estimates, one a second.
 
     `blank`: where it is not seen, images without points come, as from a detector.
     """
+    targets = targets or ConvergenceTargets()
     lens = runs["cam0"].rig.lens
     known = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
-    options = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=alike)
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), target_alike=alike, targets=targets)
     c = Calibrator(options, dict.fromkeys(runs, known), runs["cam0"].points_m)
     c.do_without(frozenset(silent))
     data = runs["cam0"]
@@ -111,6 +117,12 @@ def test_a_camera_that_comes_later_joins_those_that_are_calibrated(runs, seen):
     sigma_m = np.sqrt(np.diag(both.cameras["cam0"].T_imu_cam.covariance)[:3])
     before_m = np.sqrt(np.diag(alone[-1].cameras["cam0"].T_imu_cam.covariance)[:3])
     assert (sigma_m < 1.1 * before_m).all()  # nothing that was known is lost
+
+
+def test_advice_names_the_camera_whose_axes_it_is_about(runs):
+    end = calibrate(runs, lambda name, t_s: t_s < 5.0, targets=ConvergenceTargets(1e-5, 1e-5, 1e-7))[-1]
+    assert end.next_motion.axes and end.next_motion.camera in runs
+    assert f"of {end.next_motion.camera}: ±" in end.reason
 
 
 @pytest.mark.parametrize("from_s", [9.0, np.inf])

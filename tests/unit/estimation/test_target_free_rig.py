@@ -11,9 +11,11 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.target_free_rig import TargetFreeRig, together
+from vical_daemon.estimation.wording import guidance_text
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +148,13 @@ def test_announcements_bear_the_name_of_their_camera():
     both = together({"a": said(gap, bump, lags[0]), "b2": said(replace(gap, t_s=1.0), lags[1], jitter)})
     named = [replace(lag, camera=name) for lag, name in zip(lags, ("a", "b2"), strict=True)]
     assert both.events == [gap, bump, named[0], named[1], jitter]
+
+
+def test_of_several_cameras_the_one_whose_axes_are_to_be_turned_about_is_named():
+    value = CalibrationEstimate(1, Status.CONVERGING, "", 0.5, "", 1.0, 5, 9, {}, None, [], 1.0, 0.0, [])
+    turn = Guidance(Verb.TURN, ("x",))
+    behind = replace(value, guidance=guidance_text(turn), next_motion=turn)
+    both = together({"a": value, "b": behind})
+    assert both.next_motion == replace(turn, camera="b")
+    assert both.guidance == "rotate about the image's x axis (nod) of b"
+    assert together({"b": behind}) == behind

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from vical_daemon.estimation.events import REFERENCE, Cause, Event, EventKind, EventLog
-from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
+from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection, of_camera
 from vical_daemon.estimation.wording import (
     cause_text,
     direction_line,
@@ -80,6 +80,17 @@ def test_guidance_and_the_caption_of_the_picture_name_the_same_axes():
     show = Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left", "top"))
     assert "near the left and top edges of cam0's picture" in guidance_text(show)
     assert guidance_caption(show) == "show the target near the left and top edges of the image"
+
+
+def test_of_several_cameras_the_one_whose_axes_are_meant_is_named():
+    weak = WeakDirection(Block.LEVER_ARM, (0.0, 0.0, 1.0), 0.02, 0.001, Guidance(Verb.TURN, ("x",)))
+    named = of_camera(weak, "left")
+    assert direction_sigma(weak) == "lever arm along the optical axis: ±20.0 mm"
+    assert direction_sigma(named) == "lever arm along the optical axis of left: ±20.0 mm"
+    assert guidance_text(named.guidance) == "rotate about the image's x axis (nod) of left"
+    assert guidance_caption(named.guidance) == "turn about x of left"
+    only = Guidance(Verb.TURN, ("y",), Lack.ONE_AXIS, (0.0, 0.0, 1.0), camera="left")
+    assert "about the optical axis of left only" in guidance_text(only)
 
 
 @pytest.mark.parametrize("lack", [lack for lack in Lack if lack])

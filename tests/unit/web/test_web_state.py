@@ -199,6 +199,7 @@ def test_devices_and_metrics(bus, state, web_feed):
         (Guidance(Verb.TURN, ("z",)), ["z"], [], []),
         (Guidance(Verb.TURN, ("x", "y"), Lack.ONE_AXIS, (0.0, 0.0, 1.0)), ["x", "y"], [], []),
         (Guidance(Verb.TURN_AND_MOVE, AXES), ["x", "y", "z"], ["x", "y", "z"], []),
+        (Guidance(Verb.TURN, ("x",), camera="cam1"), [], [], []),  # of cam1's axes only the text speaks
         (Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left",)), [], [], ["left"]),
         (Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam1", edges=("left",)), [], [], []),
     ],

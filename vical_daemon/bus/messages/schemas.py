@@ -67,7 +67,7 @@ string axes                      # of the camera, e.g. xy; x right, y down, z al
 string lack                      # still slow one_axis steady_rate fast_changes edges
 float64[] turned_about           # axis about which it turned so far, in the camera frame; empty: several
 float64 rate_rps                 # how fast it turns
-string camera                    # whose image, for show
+string camera                    # whose image, for show; of several cameras, whose axes
 string[] edges                   # left right top bottom, for show
 """,
     "vical_msgs/msg/WeakDirection": """\

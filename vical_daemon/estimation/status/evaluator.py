@@ -150,11 +150,22 @@ class Evaluator:
         covariance, targets = np.array(e.T_imu_cam.covariance), self.options.targets
         return weak_directions(covariance, R_imu_cam, e.timeshift_sigma_s, self.motion, targets, gyro_bias)
 
-    def _followed(self, verdict: Verdict, R_imu_cam: FloatArray, gyro_bias: FloatArray) -> Verdict:
-        """Return what is published of a verdict; where motion is missing, with the motion to make now."""
+    def _followed(
+        self, verdict: Verdict, R_imu_cam: FloatArray, gyro_bias: FloatArray, camera: str = ""
+    ) -> Verdict:
+        """Return what is published of a verdict; where motion is missing, with the motion to make now.
+
+        Args:
+            verdict: On the data up to now.
+            R_imu_cam: Mounting of a camera, shape (3, 3).
+            gyro_bias: Shape (3,).
+            camera: Its name, if there are several.
+        """
         if verdict.guidance:
             advice = excitation_advice(self.motion, R_imu_cam, gyro_bias)
-            verdict = verdict._replace(guidance=advice or verdict.guidance)
+            verdict = verdict._replace(
+                guidance=replace(advice, camera=camera) if advice else verdict.guidance
+            )
         return self._published(verdict)
 
     def _published(self, verdict: Verdict) -> Verdict:

@@ -11,7 +11,7 @@ from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.guidance import WeakDirection
+from vical_daemon.estimation.guidance import WeakDirection, of_camera
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import OFF, SURE
@@ -165,8 +165,9 @@ class StatusEvaluator(Evaluator):
         if f is None:
             reported = self._published(verdict)
         else:
-            first = f.state.cameras[_seen(f)[0]]
-            reported = self._followed(verdict, first.R_imu_cam, f.state.gyro_bias)
+            first = _seen(f)[0]
+            named = first if len(f.layout.cameras) > 1 else ""
+            reported = self._followed(verdict, f.state.cameras[first].R_imu_cam, f.state.gyro_bias, named)
             if not reported.guidance and self.status != Status.INCONSISTENT:
                 reported = reported._replace(guidance=self._cover.advice())
         if f is None and stale is not None and self._ever_converged:
@@ -246,7 +247,8 @@ class StatusEvaluator(Evaluator):
         where = f.layout.cameras[name]
         if where.position is None and where.timeshift is None:
             return []
-        return self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
+        weak = self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
+        return weak if len(f.layout.cameras) == 1 else [of_camera(direction, name) for direction in weak]
 
     def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
         """Status, reason and guidance by the data up to now."""
