@@ -44,10 +44,10 @@ def test_a_second_estimator_of_a_camera_is_refused_in_one_line():
         pass
 
 
-def test_two_buses_with_rigs_of_one_name_do_not_hinder_each_other():
+def test_two_buses_with_rigs_of_one_name_do_not_hinder_each_other(tmp_path):
     other = replace(CONFIG, bus=replace(CONFIG.bus, socket="/run/other/zenoh.sock"))
     with claims("estimate"), run._claims(other, ["estimate"], threading.Event()):
-        pass
+        assert len(list(tmp_path.iterdir())) == 4  # two cameras each
 
 
 def test_a_refused_process_holds_nothing(tmp_path):

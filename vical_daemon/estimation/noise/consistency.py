@@ -37,7 +37,7 @@ _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
 EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
 3 s say 14, those over 1 s 8."""
 _SHARE = 0.2  # of all images, at most in one sum: the long-run variance is then known to 18 %
-_FLOOR = 0.5  # excess of the long-run variance below which sigmas stay: 1.2 times in sigma
+_FLOOR = 0.5  # excess of the long-run variance, as measured, below which sigmas stay: 1.2 times in sigma
 _GAIN_START, _GAIN_END = 0.1, 0.01  # an image's share in the scale: memory of 10, later 100 images
 _MAX_SCALE = 4.0
 """Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, the
