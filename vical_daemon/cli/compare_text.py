@@ -89,9 +89,11 @@ def _about_the_lens(camera: CameraComparison) -> list[str]:
     if not camera.held:
         return ["", f"  the lenses alone project {px} apart"]
     held, free = ("A", "B") if camera.held == "a" else ("B", "A")
+    off = "" if camera.held_off_px is None else f" (by its images {camera.held_off_px:.2f} px RMS off)"
     return [
         "",
-        f"  {held} held its lens at given values, {free} estimated it: the lenses alone project {px} apart.",
+        f"  {held} held its lens at given values{off}, {free} estimated it.",
+        f"  The lenses alone project {px} apart.",
         "  Mounting and time shift differ with the lens; compare two of the same lens to see them alone.",
     ]
 

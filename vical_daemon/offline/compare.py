@@ -15,7 +15,7 @@ from vical_daemon.results.compare import FALSE_ALARM, Verdict, directions, judge
 from vical_daemon.results.difference import Difference, NotComparableError, difference
 from vical_daemon.results.export import Rig
 from vical_daemon.results.known import LENS, KnownCamera, keys
-from vical_daemon.results.pixel_map import PixelMap, lens_displacement_px, pixel_map
+from vical_daemon.results.pixel_map import PixelMap, lens_displacement_px, lens_error_px, pixel_map
 
 SAME, CHANGED, NOT_COMPARABLE = "same", "changed", "not comparable"
 DISTANCES_M = (1.0, 10.0)
@@ -31,6 +31,7 @@ class CameraComparison:
         difference: B minus A.
         verdict: Of all of it.
         held: Which of them held its lens at given values while the other estimated it, "a" or "b"; "": none.
+        held_off_px: How far off the images of that one put this lens, RMS over the image; None: not known.
         lens_px: How far apart the lenses project, RMS over the image, and its sigma; None: no lens in both.
         maps: Over the image, by distance; empty without lens or image size.
     """
@@ -40,6 +41,7 @@ class CameraComparison:
     difference: Difference | None = None
     verdict: Verdict | None = None
     held: str = ""
+    held_off_px: float | None = None
     lens_px: tuple[float, float] | None = None
     maps: tuple[PixelMap, ...] = ()
 
@@ -168,11 +170,13 @@ def _compare(a: KnownCamera, b: KnownCamera, distances_m: tuple[float, ...]) -> 
     verdict = judge(apart)
     maps = tuple(m for distance_m in distances_m if (m := pixel_map(apart, distance_m)) is not None)
     held = "" if a.lens_held == b.lens_held or not apart.has_lens else "a" if a.lens_held else "b"
+    of_held = a if held == "a" else b
+    off_px = lens_error_px(of_held) if held and of_held.lens_contradicted else None
     lens_px = None
     if apart.has_lens:
         base = a if apart.model == a.model else b
         lens_px = lens_displacement_px(base, apart.d[LENS], apart.covariance[LENS, LENS])
-    return CameraComparison(names, "", apart, verdict, held, lens_px, maps)
+    return CameraComparison(names, "", apart, verdict, held, off_px, lens_px, maps)
 
 
 def _imu(a: Rig | None, b: Rig | None) -> tuple[FloatArray, FloatArray] | None:
@@ -197,7 +201,7 @@ def _camera_document(camera: CameraComparison) -> dict[str, Any]:
     v = camera.verdict
     out |= {"chi_square": v.chi_square, "dof": v.dof, "probability": v.probability, "changed": list(v.blocks)}
     out |= {"common_s": camera.difference.common_s, "lens_models_unlike_px": camera.difference.unlike_px}
-    out["lens_held_by"] = camera.held
+    out |= {"lens_held_by": camera.held, "lens_held_off_px": camera.held_off_px}
     out["directions"] = [
         {
             "name": one.name,

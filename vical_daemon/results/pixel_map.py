@@ -17,7 +17,7 @@ from vical_daemon.estimation.model.camera_rays import rays_over_image, unproject
 from vical_daemon.estimation.significance import chi_square_limit
 from vical_daemon.results.compare import FALSE_ALARM
 from vical_daemon.results.difference import Difference
-from vical_daemon.results.known import KnownCamera
+from vical_daemon.results.known import LENS, KnownCamera
 
 GRID = (9, 7)  # columns and rows, corners of the image included
 _STEP = 1e-3  # of a sigma: for derivatives
@@ -113,13 +113,24 @@ def lens_displacement_px(camera: KnownCamera, moved: FloatArray, P: FloatArray) 
         moved: Errors of the lens, shape (n,).
         P: Their covariance, shape (n, n).
     """
+    J = _lens_slopes(camera)[:, : len(moved)]
+    apart = J @ moved
+    rms = float(np.linalg.norm(apart))
+    slope = J.T @ apart / max(rms, 1e-300)
+    return rms, float(np.sqrt(slope @ P @ slope))
+
+
+def lens_error_px(camera: KnownCamera) -> float:
+    """How far a lens is expected to project points from where they appear, by its covariance, RMS, px."""
+    J = _lens_slopes(camera)
+    return float(np.sqrt(np.einsum("ij,jk,ik->", J, camera.covariance[LENS, LENS], J)))
+
+
+def _lens_slopes(camera: KnownCamera) -> FloatArray:
+    """Derivatives of n pixels over the image by the lens, over the root of n: squares are means."""
     lens = camera.lens
     assert lens is not None
     size = camera.resolution or (round(2.0 * lens[2]), round(2.0 * lens[3]))
     rays = rays_over_image(lens[:4], lens[4:], camera.model, size)
     J = project_jacobians(rays, lens[:4], lens[4:], camera.model)[2].reshape(2 * len(rays), -1)
-    J = J[:, : len(moved)] / np.sqrt(len(rays))
-    apart = J @ moved
-    rms = float(np.linalg.norm(apart))
-    slope = J.T @ apart / max(rms, 1e-300)
-    return rms, float(np.sqrt(slope @ P @ slope))
+    return np.asarray(J / np.sqrt(len(rays)))

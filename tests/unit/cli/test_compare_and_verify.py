@@ -86,6 +86,28 @@ def test_compare_report_shows_what_the_json_says(write, tmp_path, capsys):
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text)
 
 
+def test_compare_names_a_lens_that_one_of_them_held(rig, tmp_path, capsys):
+    """By its own images its cx may be 3 px off: every point then appears 3 px from where it is projected."""
+    only = replace(rig, cameras={"cam0": rig.cameras["cam0"]}, status="converged")
+    document = json.loads(export(only, "json")[0].text)
+    entry = document["cameras"]["cam0"]
+    n = len(entry["distortion"])
+    paths = []
+    for name, lens_px, fixed in (("held", [1e-4, 1e-4, 3.0, 1e-4], ["intrinsics"]), ("free", [1.0] * 4, [])):
+        lens = [*lens_px, *[1e-6 if fixed else 1e-3] * n]
+        entry |= {"intrinsics_sigma": lens[:4], "distortion_sigma": lens[4:]}
+        entry["calibration_covariance"] = np.diag(np.square([1e-3] * 6 + [1e-4] + lens)).tolist()
+        (tmp_path / name).write_text(json.dumps(document | {"fixed": fixed}))
+        paths.append(str(tmp_path / name))
+    _, out, _ = run(capsys, "compare", *paths)
+    assert "A held its lens at given values (by its images 3.00 px RMS off), B estimated it." in out
+    _, out, _ = run(capsys, "compare", *paths[::-1], "--report", str(tmp_path / "page.html"))
+    assert "B held its lens at given values (by its images 3.00 px RMS off), A estimated it." in out
+    assert "by its images 3.00 px RMS off" in (tmp_path / "page.html").read_text()
+    camera = json.loads(run(capsys, "compare", *paths, "--json")[1])["cameras"]["cam0"]
+    assert (camera["lens_held_by"], camera["lens_held_off_px"]) == ("a", pytest.approx(3.0))
+
+
 def test_compare_matrix_of_three(write, capsys):
     files = [write("a.json"), write("b.json"), write("c.json", 0.1)]
     code, out, _ = run(capsys, "compare", *files, "--matrix")

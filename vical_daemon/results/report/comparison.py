@@ -74,9 +74,11 @@ def _head(document: Mapping[str, Any], sources: tuple[str, str]) -> str:
         )
         if camera["lens_held_by"]:
             held, free = ("A", "B") if camera["lens_held_by"] == "a" else ("B", "A")
+            px = camera["lens_held_off_px"]
+            off = "" if px is None else f" (by its images {px:.2f} px RMS off)"
             advice.append(
-                f"{held} held its lens at given values, {free} estimated it. Mounting and time shift differ "
-                "with the lens: compare two of the same lens to see them alone."
+                f"{held} held its lens at given values{off}, {free} estimated it. Mounting and time shift "
+                "differ with the lens: compare two of the same lens to see them alone."
             )
         if camera["common_s"] > 1.0:
             advice.append(f"{camera['common_s']:.0f} s of data are in both, and counted once.")
