@@ -66,8 +66,8 @@ class CameraEstimate:
             s, px, rotation error local (right); zero rows where not estimated; lens model errors
             are not correlated with the pose, unlike above; []: not known (it does not travel in the message).
         stamp_jitter_s: Measured jitter of the image stamps, one standard deviation, s; 0: none found.
-        model_fits: Images show no errors that last or exceed their noise. False as well where that is not
-            known: too few images, or read from a message.
+        model_fits: Images show no errors that last or exceed their noise; None: not known (too few images, or
+            read from a message).
     """
 
     T_imu_cam: PoseEstimate
@@ -88,7 +88,7 @@ class CameraEstimate:
     withheld: list[WeakDirection] = field(default_factory=list)
     stamp_jitter_s: float = 0.0
     calibration_covariance: list[list[float]] = field(default_factory=list)
-    model_fits: bool = False
+    model_fits: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

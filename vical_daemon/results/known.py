@@ -44,6 +44,7 @@ class KnownCamera:
         inflation: By what `covariance` is too large on its diagonal, because correlations are not known.
         lens_held: The lens was held at given values, not estimated.
         lens_contradicted: It was held, and `covariance` includes by how much images contradict it.
+        model_fits: See `CameraEstimate`.
         duration_s: Seconds of data used; 0: not known.
         reading_hashes: See `CalibrationEstimate`; (): not known.
         serials: Serial numbers of imu and camera; "": not known.
@@ -62,6 +63,7 @@ class KnownCamera:
     inflation: float = 1.0
     lens_held: bool = False
     lens_contradicted: bool = False
+    model_fits: bool | None = None
     duration_s: float = 0.0
     reading_hashes: tuple[int, ...] = ()
     serials: tuple[str, str] = ("", "")
@@ -154,6 +156,7 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
             inflation,
             "intrinsics" in rig.fixed or (bool(camera.lens_sigma) and not any(camera.lens_sigma)),
             "intrinsics" in rig.fixed and any(camera.lens_sigma),
+            camera.model_fits,
             rig.duration_s,
             rig.reading_hashes,
             (rig.devices.get("imu", ""), rig.devices.get(f"camera/{camera.name}", "")),

@@ -74,10 +74,12 @@ class Verifier:
             if estimate.status is Status.INCONSISTENT or name not in found:
                 check.why = estimate.reason or "no calibration from this recording"
                 continue
-            self._weigh(check, found[name], fits=estimate.cameras[name].model_fits)
+            self._weigh(check, found[name])
         return all(check.answer is not Answer.CANNOT_TELL for check in self.cameras.values())
 
-    def _weigh(self, check: CameraCheck, found: KnownCamera, *, fits: bool) -> None:
+    def _weigh(self, check: CameraCheck, found: KnownCamera) -> None:
+        # lens, board and imu are the same: where this recording is too short to tell, what the other one said
+        fits = check.stored.model_fits if found.model_fits is None else found.model_fits
         seconds = math.inf if fits else check.seconds
         try:
             weighed = self._odds(check, found if check.lens_asked else found.without_lens(), seconds)

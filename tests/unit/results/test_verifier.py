@@ -103,6 +103,21 @@ def test_poor_motion_cannot_tell_and_names_what_is_missing(stored):
     assert blocks["time shift"]["counts_from"] == pytest.approx(1e-3)
 
 
+def test_whether_the_model_fits_is_taken_from_the_stored_calibration_where_a_short_recording_cannot_tell(stored):
+    def visible_from(before, today):
+        verifier = Verifier({"cam0": CameraCheck(replace(stored, model_fits=before), lens_asked=True)})
+        now = estimate()
+        camera = replace(now.cameras["cam0"], model_fits=today)
+        verifier.look(replace(now, cameras={"cam0": camera}))
+        return verifier.document()["cameras"]["cam0"]["blocks"]["rotation"]["visible_from"]
+
+    fits = visible_from(None, True)
+    assert visible_from(True, None) == fits
+    assert visible_from(False, True) == fits  # the recording itself has shown it
+    for before, today in ((None, None), (False, None), (True, False)):
+        assert visible_from(before, today) > 1.5 * fits
+
+
 def test_contradictory_data_are_not_weighed(stored):
     verifier = Verifier({"cam0": CameraCheck(stored, lens_asked=True)})
     assert not verifier.look(replace(estimate(), status=Status.INCONSISTENT, reason="images do not fit"))

@@ -43,7 +43,7 @@ def camera_snapshot(
     sigma_px: float,
     rolling: bool = True,
     jitter_s: float = 0.0,
-    model_fits: bool = False,
+    model_fits: bool | None = None,
 ) -> CameraEstimate:
     """Put what is reported of one camera together.
 

@@ -186,13 +186,15 @@ class Consistency:
         self.suspicion += _MOST - _CUSUM_DRIFT
 
     @property
-    def fits(self) -> bool:
-        """Enough images have been seen, and their errors neither last nor exceed their noise.
+    def fits(self) -> bool | None:
+        """Whether the errors of images neither last nor exceed their noise; None: too few images to tell.
 
         Errors that last are ruled out where the long-run variance is less than one standard deviation above
         what the filter predicts; sigmas grow where it is `PERHAPS_SIGMAS` above.
         """
-        return self._weight >= _TELLING and self.scale == 1.0 and self._lasting < 1.0
+        if self.scale != 1.0 or self._lasting >= 1.0:
+            return False
+        return True if self._weight >= _TELLING else None
 
     @property
     def level(self) -> float:

@@ -37,6 +37,7 @@ class RigCamera:
         unobservable: Directions that the motion did not reveal: do not use their values.
         lens_sigma: Standard deviations of fx fy cx cy and the distortion; (): not known.
         calibration_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.
+        model_fits: See `CameraEstimate`.
 
     Raises:
         ExportError: A number that is not finite, or a focal length of 0 or less: no file that holds such
@@ -60,6 +61,7 @@ class RigCamera:
     readout_axis: str = ""
     lens_sigma: tuple[float, ...] = ()
     calibration_covariance: FloatArray | None = None
+    model_fits: bool | None = None
 
     def __post_init__(self) -> None:
         numbers = {

@@ -107,6 +107,7 @@ def _camera(name: str, entry: Any) -> RigCamera:
             unobservable=tuple(entry.get("unobservable") or ()),
             lens_sigma=tuple(float(v) for v in lens_sigma) if len(lens_sigma) == n - 7 else (),
             calibration_covariance=None if not joint else np.array(joint, dtype=np.float64).reshape(n, n),
+            model_fits=entry.get("model_fits"),
         )
     except KeyError as error:
         raise ExportError(f"cameras.{name}: no key {error}") from error

@@ -71,7 +71,7 @@ def test_larger_innovations_that_the_predicted_motion_dominates_raise_the_factor
         common = (ways @ rng.normal(size=8) * 2.0).reshape(-1, 2)
         c.learn(c.images / 5.0, UV, common, ways, np.eye(8), SIGMA * np.sqrt(c.scale))
     assert 2.0 < c.factor < 6.0
-    assert not c.fits
+    assert c.fits is False
 
 
 def test_a_model_fits_only_where_errors_that_last_are_ruled_out():
@@ -89,7 +89,7 @@ def test_a_model_fits_only_where_errors_that_last_are_ruled_out():
 def test_whether_the_model_fits_is_not_known_from_a_few_images():
     c = Consistency()
     feed(c, np.random.default_rng(0), 30)
-    assert not c.fits
+    assert c.fits is None
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 60.0])
