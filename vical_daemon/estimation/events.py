@@ -82,7 +82,6 @@ class Cause(StrEnum):
     NO_PARALLAX = "no_parallax"
     SECOND_AXIS = "second_axis"
     COLUMNS_READ = "columns_read"
-    IMAGES_SHIFTED = "images_shifted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ class Event:
         value: Its figure, in the SI unit that `REFERENCE` gives; None: it has none.
         sigma: Standard deviation of the value, same unit; None: not known.
         t_s: When, in seconds since the first inertial reading; None: not known.
-        cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`. Of `STAMP_JITTER`: what else it may be.
+        cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`.
         cause_value: Figure of the cause, see `Cause`; None: it has none.
         said: Text of the kinds in `SAID`. Those of kind `OTHER` come from a log written before events were
             typed, or after a kind was added that is not known here.
@@ -262,8 +261,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.STAMP_JITTER: About(
         "The stamps of the images jitter; allowed for. Value: standard deviation.",
         "s",
-        "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently. "
-        "Without one, images that are shifted as a whole are not distinguished: cause `images_shifted`.",
+        "Once per camera, from 0.3 ms, once neighbours are known to be late independently.",
     ),
     EventKind.STAMPED_ON_ARRIVAL: About(
         "A live camera samples evenly, but stamps on arrival. From now on its images are put on an even "

@@ -275,7 +275,6 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.NO_PARALLAX: lambda _: (
         "the camera stands still, everything is far away, or features are lost before they show depth"
     ),
-    Cause.IMAGES_SHIFTED: lambda _: "whole images are shifted: not distinguished without a board",
     Cause.SECOND_AXIS: lambda _: (
         "the rig now turns about a second axis: restarting, to estimate the whole lever arm"
     ),
@@ -397,11 +396,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     ),
     EventKind.STAMP_JITTER: (
         "",
-        lambda e: (
-            f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}"
-            + (f", or {cause_text(e.cause)}" if e.cause else "")
-            + "; allowed for"
-        ),
+        lambda e: f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for",
     ),
     EventKind.STAMPED_ON_ARRIVAL: (
         "",

@@ -103,7 +103,9 @@ def test_poor_motion_cannot_tell_and_names_what_is_missing(stored):
     assert blocks["time shift"]["counts_from"] == pytest.approx(1e-3)
 
 
-def test_whether_the_model_fits_is_taken_from_the_stored_calibration_where_a_short_recording_cannot_tell(stored):
+def test_whether_the_model_fits_is_taken_from_the_stored_calibration_where_a_short_recording_cannot_tell(
+    stored,
+):
     def visible_from(before, today):
         verifier = Verifier({"cam0": CameraCheck(replace(stored, model_fits=before), lens_asked=True)})
         now = estimate()

@@ -1,4 +1,4 @@
-"""Stamp jitter: the size from which it is announced, and its estimate from errors and their variances.
+"""Stamp jitter: the size from which it is announced. A variance from errors and their usual variances.
 
 The estimate is for use without a board; with one, `shared_errors` does it.
 """
@@ -9,9 +9,8 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import MEDIAN_CHI2
-from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
-FLOOR_S = 2e-5  # of a jitter that is one
 _ROUNDS = 8  # of scoring, from a start by medians
 ANNOUNCED_S = 3e-4
 """From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
@@ -20,22 +19,27 @@ PERSISTENT = 0.5
 jitter (0)."""
 
 
-def excess(square: FloatArray, usual: FloatArray) -> float:
-    """Standard deviation, s, that squared errors show beyond their usual variances; 0 if by chance.
+def evidence(square: FloatArray, usual: FloatArray) -> float:
+    """By how many standard deviations squared errors exceed their usual variances.
 
     Args:
-        square: Squared errors, s^2, shape (n,).
-        usual: Their variances without, s^2, shape (n,).
+        square: Squared errors, shape (n,).
+        usual: Their variances without anything else, in the same unit, shape (n,).
     """
     ratio = np.minimum(square / usual, SURE_SIGMAS**2)
     telling = 1.0 / np.maximum(usual, np.median(usual))  # images with a wide prior have little to say
-    if telling @ (ratio - 1.0) < LIKELY_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
-        return 0.0
-    # maximum likelihood by scoring
+    return float(telling @ (ratio - 1.0) / np.sqrt(2.0 * float(telling @ telling)))
+
+
+def excess(square: FloatArray, usual: FloatArray) -> float:
+    """Standard deviation beyond their usual variances that squared errors show; arguments as `evidence`.
+
+    Maximum likelihood by scoring.
+    """
     variance = max(float(np.median(square)) / MEDIAN_CHI2 - float(np.median(usual)), 0.0)
     for _ in range(_ROUNDS):
         expected = usual + variance
         weight = expected**-2
-        excess = np.minimum(square, SURE_SIGMAS**2 * expected) - usual
-        variance = max(float(weight @ excess / weight.sum()), 0.0)
-    return float(np.sqrt(variance)) if variance > FLOOR_S**2 else 0.0
+        more = np.minimum(square, SURE_SIGMAS**2 * expected) - usual
+        variance = max(float(weight @ more / weight.sum()), 0.0)
+    return float(np.sqrt(variance))

@@ -38,7 +38,7 @@ of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in t
 _LEAST_LANDMARKS = 8  # as many as the eight-point algorithm needs
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
-_MORE = 1.2  # times the jitter that is allowed for: so much does not end a window
+_MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
 
 
 class Fit(NamedTuple):
@@ -155,9 +155,9 @@ class Bundle:
                 continue
             else:
                 now.view = self._applied(step, now.view.seen)
-                if not self._suspects_jitter(now):
+                if not self._suspects_offsets(now):
                     fit = self._result(now, step.root, steps, settled=True)
-                    if fit is None or 2 * steps > most or not self._jitters_more(fit):
+                    if fit is None or 2 * steps > most or not self._shows_more(fit):
                         return fit
                 w.bad.clear()  # late images had looked like outliers
                 now.view, now.cleaned = self.problem.view(w.observe()), False
@@ -285,20 +285,18 @@ class Bundle:
         return self.problem.view(seen)
 
     # ------------------------------------------------------------------ noise, outliers, result
-    def _suspects_jitter(self, now: _Present) -> bool:
-        """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
+    def _suspects_offsets(self, now: _Present) -> bool:
+        """Whether what was adjusted shows images to be off in one way more; from then on they may be."""
         problem = self.problem
-        if problem.noise.jitter_s:
-            return False
-        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(now.view))
-        return problem.noise.jitter_s > 0.0
+        before, problem.noise = problem.noise, problem.suspected(now.view)
+        return problem.noise != before
 
-    def _jitters_more(self, fit: Fit) -> bool:
-        """Whether stamps jitter by much more than was allowed for; from then on they may (EM, one step)."""
-        allowed_s, shown_s = self.problem.noise.jitter_s, fit.noise.jitter_s
-        more = shown_s > _MORE * allowed_s > 0.0
+    def _shows_more(self, fit: Fit) -> bool:
+        """Whether images are off by much more than was allowed for; then they may be (one step of EM)."""
+        allowed, shown = self.problem.noise.offsets, fit.noise.offsets
+        more = bool(((shown > _MORE * allowed) & (allowed > 0.0)).any())
         if more:
-            self.problem.noise = self.problem.noise._replace(jitter_s=shown_s)
+            self.problem.noise = self.problem.noise.with_offsets(shown)
         return more
 
     def _learn_noise(self, view: View) -> None:
@@ -343,7 +341,7 @@ class Bundle:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
-        inertial, jitter_s, alike = links_left(w, self.problem.noise.jitter_s, order, root)
+        inertial, shown, alike = links_left(w, self.problem.noise.offsets, order, root)
         good = ok & (np.vecdot(e, e) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
@@ -352,7 +350,7 @@ class Bundle:
             squares,
             max(self._dof(seen), 1),
             inertial,
-            self.problem.noise._replace(jitter_s=jitter_s, alike=alike),
+            self.problem.noise.with_offsets(shown)._replace(alike=alike),
             steps,
             settled,
             int(good.sum()),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.noise.stamp_jitter import FLOOR_S
-from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.image_offsets import FLOORS, ImageOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
 
 
@@ -52,12 +51,12 @@ def link_errors(window: Window) -> tuple[FloatArray, FloatArray]:
     return w.links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
 
 
-def add_links(window: Window, jitter_s: float, order: Order, H: FloatArray, g: FloatArray) -> float:
+def add_links(window: Window, sigmas: FloatArray, order: Order, H: FloatArray, g: FloatArray) -> float:
     """Add the links and the walk of the biases to the normal equations, in place.
 
     Args:
         window: Present values.
-        jitter_s: Standard deviation of the images' stamps, s; 0: exact.
+        sigmas: Of what images are off by, see `ImageOffsets`; zeros: exact.
         order: Places of the unknowns.
         H: Normal matrix, shape (n, n).
         g: Gradient, shape (n,).
@@ -91,10 +90,10 @@ def add_links(window: Window, jitter_s: float, order: Order, H: FloatArray, g: F
             side = A[:, first : first + 9, 24:].reshape(-1, len(order.imu))
             _add_side(H, frames.reshape(-1), order.imu, side)
     cost = float((e**2).sum()) + _add_walk(window, order, H, g)
-    if jitter_s:
-        late = StampOffsets(window, e, J, jitter_s)
-        late.eliminate(H, g, J, order.of_links(knots))
-        cost -= late.explained()
+    if sigmas.any():
+        off = ImageOffsets(window, e, J, sigmas)
+        off.eliminate(H, g, J, order.of_links(knots))
+        cost -= off.explained()
     return cost
 
 
@@ -121,19 +120,23 @@ def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> flo
     return cost
 
 
-def links_left(window: Window, jitter_s: float, order: Order, root: FloatArray) -> tuple[float, float, float]:
-    """Mean squared error of the links, the jitter of the stamps that they show, s, and how alike it is.
+def links_left(
+    window: Window, sigmas: FloatArray, order: Order, root: FloatArray
+) -> tuple[float, FloatArray, float]:
+    """Mean squared error of the links, by how much they show images to be off, and how alike delays are.
 
     Args:
         window: Adjusted.
-        jitter_s: Jitter that was allowed for.
+        sigmas: Of what images are off by, as allowed for.
         order: Places of the unknowns.
         root: Lower Cholesky factor of the normal matrix; what is above its diagonal does not count.
     """
     e, J = link_errors(window)
-    if not jitter_s:
-        return float((e**2).mean()), 0.0, 0.0
-    late = StampOffsets(window, e, J, jitter_s)
-    shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
-    left = (float((e**2).sum()) - late.explained()) / e.size
-    return left, shown_s if shown_s > FLOOR_S else 0.0, late.alike()
+    if not sigmas.any():
+        return float((e**2).mean()), np.zeros(3), 0.0
+    off = ImageOffsets(window, e, J, sigmas)
+    squares = off.mean_squares(J, order.of_links(window.knots()), root)
+    squares[1:] = squares[1:].mean()
+    shown = np.sqrt(squares)
+    left = (float((e**2).sum()) - off.explained()) / e.size
+    return left, np.where(shown > FLOORS, shown, 0.0), off.alike()

@@ -13,10 +13,11 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
-from vical_daemon.estimation.noise.stamp_jitter import excess
+from vical_daemon.estimation.noise.stamp_jitter import evidence, excess
 from vical_daemon.estimation.robust import huber_weight
+from vical_daemon.estimation.significance import LIKELY_SIGMAS
+from vical_daemon.estimation.smoother.image_offsets import FLOORS, LATE, SHIFTED, ImageOffsets
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
-from vical_daemon.estimation.smoother.jitter import first_guess
 from vical_daemon.estimation.smoother.marginal_prior import (
     BIASES,
     SPEED,
@@ -83,7 +84,8 @@ class ImageNoise(NamedTuple):
     Attributes:
         sigma_px: Of a feature, px.
         spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
-        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
+        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until errors contradict.
+        shift_px: Standard deviation by which whole images are off, per axis, px; likewise.
         lens_px: Misfit of the lens model, see `LensMisfit`, px.
         alike: Correlation of what the stamps of neighbouring images are off by, as measured.
     """
@@ -91,8 +93,18 @@ class ImageNoise(NamedTuple):
     sigma_px: float
     spread: float = 1.0
     jitter_s: float = 0.0
+    shift_px: float = 0.0
     lens_px: float = SYSTEMATIC_PX
     alike: float = 0.0
+
+    @property
+    def offsets(self) -> FloatArray:
+        """Standard deviations of what images are off by, see `ImageOffsets`, shape (3,)."""
+        return np.array([self.jitter_s, self.shift_px, self.shift_px])
+
+    def with_offsets(self, sigmas: FloatArray) -> ImageNoise:
+        """The same with other standard deviations of what images are off by, shape (3,)."""
+        return self._replace(jitter_s=float(sigmas[0]), shift_px=float(sigmas[1]))
 
 
 class Problem:
@@ -220,15 +232,6 @@ class Problem:
         moved = so3.cross(view.x_imu, view.rates) - rho[:, None] * forward
         return np.asarray(np.einsum("nij,nj->ni", JR, moved))
 
-    def pixels_late(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
-        by_shift, e = self._whitened_by_shift(view)
-        seen, F = view.seen, len(self.window.frames)
-        size = np.bincount(seen.frame, np.vecdot(by_shift, by_shift), F)
-        late = np.bincount(seen.frame, (by_shift * e).sum(axis=1), F)
-        shown = size > 0.0
-        return late[shown] / size[shown], self.noise.spread**2 / size[shown]
-
     def late_by_columns(self, view: View) -> float:
         """By how much at least the squared errors would fall if columns were read one after the other.
 
@@ -283,7 +286,7 @@ class Problem:
         W[:, :, 6 * F :] = own[:, :, columns]
         by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
         by_frame[seen.landmark, :, seen.frame] = np.swapaxes(J[:, :, :3], 1, 2) @ J[:, :, 3:9]
-        cost += add_links(w, self.noise.jitter_s, order, H, g)
+        cost += add_links(w, self.noise.offsets, order, H, g)
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
@@ -296,14 +299,37 @@ class Problem:
         lens = _CONSTANTS + layout.camera.intrinsics.start - layout.dynamic + np.arange(self.own)
         return np.concatenate([constants, lens])
 
-    def suspected_jitter_s(self, view: View) -> float:
-        """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
+    def suspected(self, view: View) -> ImageNoise:
+        """The noise with one way more in which errors show images to be off beyond chance, or as it was.
 
-        A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
+        A late image of a turning rig looks like one that is shifted: the surer of the two goes first.
         """
-        by_links = first_guess(self.window, *link_errors(self.window))
-        late, variance = self.pixels_late(view)
-        return float(np.hypot(by_links, excess(late**2, variance)))
+        e, J = link_errors(self.window)
+        sigmas, allowed = self.noise.offsets, None
+        if sigmas.any():
+            allowed = ImageOffsets(self.window, e, J, sigmas)
+            e = allowed.left(e)
+        by_pixels, found, surest = self._information_by_pixels(view), self.noise, LIKELY_SIGMAS
+        for name, way in (("jitter_s", LATE), ("shift_px", SHIFTED)):
+            if sigmas[way].any():
+                continue
+            alone = np.zeros(3)
+            alone[way] = 1.0
+            shown = ImageOffsets(self.window, e, J, alone).shown(by_pixels, allowed)
+            sigma, sure = excess(*shown), evidence(*shown)
+            if sigma > FLOORS[way][0] and sure > surest:
+                found, surest = self.noise._replace(**{name: sigma}), sure
+        return found
+
+    def _information_by_pixels(self, view: View) -> FloatArray:
+        """What the pixels of each image know of its offsets, shape (F, 3, 3)."""
+        root = np.sqrt(self.pixel_errors(view)[1]) / self.noise.sigma_px
+        ways = np.zeros((len(root), 2, 3))
+        ways[:, :, 0] = self._whitened_by_shift(view)[0]
+        ways[:, 0, 1] = ways[:, 1, 2] = root
+        out = np.zeros((len(self.window.frames), 3, 3))
+        np.add.at(out, view.seen.frame, np.swapaxes(ways, 1, 2) @ ways)
+        return out / self.noise.spread**2
 
     # ------------------------------------------------------------------ prior
     def _prior_errors(self) -> tuple[FloatArray, FloatArray]:

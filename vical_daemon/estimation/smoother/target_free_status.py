@@ -200,7 +200,7 @@ class TargetFreeStatus(Evaluator):
         """A window is complete and agreed."""
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
-        self._announce_jitter(self.camera, self.jitter_s, Cause.IMAGES_SHIFTED)
+        self._announce_jitter(self.camera, self.jitter_s)
 
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.

@@ -122,9 +122,9 @@ class Evaluator:
         square, dof = map(sum, zip(*self._squares, strict=True)) if self._squares else (0.0, 0)
         return square / dof if dof else 0.0
 
-    def _announce_jitter(self, camera: str, jitter_s: float, cause: Cause = Cause.NONE) -> None:
+    def _announce_jitter(self, camera: str, jitter_s: float) -> None:
         if jitter_s >= ANNOUNCED_S:
-            event = Event(EventKind.STAMP_JITTER, camera, float(jitter_s), cause=cause)
+            event = Event(EventKind.STAMP_JITTER, camera, float(jitter_s))
             self.announce(event, once=f"jitter {camera}")
 
     def _change(self, why: Cause, status: Status, camera: str = "") -> None:
