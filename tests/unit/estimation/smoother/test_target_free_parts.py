@@ -254,7 +254,7 @@ def errors_where_images_are_off(window, offsets):
     """Errors of the links if image k was taken offsets[k, 0] s late, and lies offsets[k, 1:] px off."""
     rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
     late, (right, down), camera = offsets[:, :1], offsets[:, 1:].T, window.camera
-    # a camera that turns about its x axis sees everything lower, one that turns about y everything to the left
+    # a camera that turns about its x axis sees everything lower, about its y axis more to the left
     turn = np.column_stack([down / camera.intrinsics[1], -right / camera.intrinsics[0], 0.0 * down])
     R = window.R @ so3.exp(-late * rates - turn @ camera.R_imu_cam.T)
     p, v = window.p - late * window.v, window.v - late * push
