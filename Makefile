@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BENCH ?= montecarlo
 PYTEST_ARGS ?=
+INSTALL = $(BIN)/python -m pip install -qq --no-compile
 VENV := .venv
 BIN := $(VENV)/bin
 export OMP_NUM_THREADS = 1
@@ -44,7 +45,7 @@ $(VENV)/.user $(VENV)/.test $(VENV)/.check $(VENV)/.docs $(VENV)/.dist: $(VENV)/
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "vical needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
 	@$(BIN)/python -c '' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { echo "cannot make $(VENV); on Debian and Ubuntu: apt install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV): $* (once, about a minute) ..."
-	@$(BIN)/python -m pip install -qq --no-compile --constraint constraints.txt --editable '.$(patsubst %,[%],$(filter-out user,$*))'
+	@$(INSTALL) --constraint constraints.txt --editable '.$(patsubst %,[%],$(filter-out user,$*))'
 	@touch $(VENV)/.user $@
 
 clean:
