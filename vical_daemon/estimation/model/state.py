@@ -327,7 +327,8 @@ def rotation_from_grp(p: FloatArray) -> FloatArray:
     m = 0.25 * p
     s = np.vecdot(m, m)
     d = 1.0 / (1.0 + s) ** 2
-    return so3.polynomial(1.0 - 8.0 * d * s, 4.0 * (1.0 - s) * d, 8.0 * d, m)
+    gamma = 8.0 * d
+    return so3.polynomial(1.0 - gamma * s, 4.0 * (1.0 - s) * d, gamma, m)
 
 
 def rotation_of_grp(p: FloatArray) -> FloatArray:
