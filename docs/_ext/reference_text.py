@@ -44,18 +44,6 @@ def messages_text() -> str:
     return "\n\n".join(f"### {name}\n\n```text\n{text.rstrip()}\n```" for name, text in DEFINITIONS.items())
 
 
-def events_table() -> str:
-    """The table of events."""
-    from vical_daemon.estimation.events import REFERENCE
-
-    lines = ["| kind | meaning | unit | when |", "|---|---|---|---|"]
-    lines += [
-        f"| `{kind}` | {about.meaning} | {about.unit or 'none'} | {about.when} |"
-        for kind, about in REFERENCE.items()
-    ]
-    return "\n".join(lines)
-
-
 def causes_table() -> str:
     """The table of causes."""
     from vical_daemon.estimation.events import Cause

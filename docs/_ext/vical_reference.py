@@ -29,7 +29,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
     for name, function in (
         ("vical-topics", reference_text.topics_table),
-        ("vical-events", reference_text.events_table),
         ("vical-causes", reference_text.causes_table),
         ("vical-messages", reference_text.messages_text),
         ("vical-config", reference_text.config_text),

@@ -78,7 +78,7 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDi
     from vical_daemon.estimation.status.excitation import RunningMotion, weak_directions
     from vical_daemon.estimation.tools.observability import covariance_of
 
-    covariance = covariance_of(result)
+    covariance = covariance_of(result, _PRIOR)
     order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]
     index = np.concatenate([np.arange(s.start, s.stop) for s in order])
     turning = RunningMotion(memory_s=1e6)  # all of it
@@ -134,9 +134,7 @@ def _document(
         "unknowns": result.unknowns,
         "observable": result.rank == result.unknowns and not missing,
         "sigma": {
-            name: sigma(name)
-            for name in result.blocks
-            if name not in ("attitude", "position", "velocity", "landmark")
+            name: sigma(name) for name in result.blocks if name not in ("attitude", "position", "velocity")
         },
         "lost": [{"parts": dict(d.parts), "strength": d.strength} for d in result.lost],
         "missing": [

@@ -200,9 +200,8 @@ _LACKS: dict[Lack, Callable[[Guidance], str]] = {
 # -------------------------------------------------------------------------------------------------- events
 def event_text(event: Event) -> str:
     """Return the announcement as one line, with the name of the camera that it concerns."""
-    label, says = _EVENTS[event.kind]
     named = f"{event.camera}: " if event.camera else ""
-    return f"{label}{named}{says(event)}"
+    return f"{_LABELS.get(event.kind, '')}{named}{_EVENTS[event.kind](event)}"
 
 
 def event_document(event: Event) -> dict[str, Any]:
@@ -248,37 +247,31 @@ def direction_document(weak: WeakDirection) -> dict[str, Any]:
 
 def cause_text(cause: Cause, value: float | None = None) -> str:
     """Say why a calibration or a window was given up."""
-    return _CAUSES[cause](math.nan if value is None else value)
+    return _CAUSES[cause].format(math.nan if value is None else value)
 
 
-_CAUSES: dict[Cause, Callable[[float], str]] = {
-    Cause.NONE: lambda _: "",
-    Cause.STORED_DIFFERS: lambda _: "since the stored calibration",
-    Cause.BUMPED: lambda _: "since before the bump",
-    Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even after the pose was re-initialised",
-    Cause.IMAGES_DISAGREE: lambda _: (
-        "images and motion disagree by more than before: the camera or the target moved, or the lens changed"
-    ),
-    Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate is not finite",
-    Cause.CALIBRATION_CONTRADICTED: lambda _: (
-        "the last seconds move the calibration by more than the sigmas allow"
-    ),
-    Cause.WINDOW_CONTRADICTED: lambda _: "the last seconds do not fit the calibration; looking again",
-    Cause.NO_IMAGES: lambda v: f"no usable images for {v:.1f} s",
-    Cause.CLOCK_SET: lambda _: "the camera's clock was set",
-    Cause.INERTIAL_GAP: lambda _: "inertial data have a gap",
-    Cause.TOO_FEW_FEATURES: lambda _: "too few features can be followed",
-    Cause.FEATURES_CONTRADICT: lambda _: "the features of the last seconds contradict each other",
-    Cause.FEATURES_MISS: lambda v: f"features are {v:.1f} px from where they are expected",
-    Cause.INERTIAL_MISFIT: lambda v: f"inertial data and images disagree ({v:.1f} times their noise)",
-    Cause.SCENE_MOVES: lambda v: f"{v:.0%} of the features do not move with the scene",
-    Cause.NO_PARALLAX: lambda _: (
-        "the camera stands still, everything is far away, or features are lost before they show depth"
-    ),
-    Cause.SECOND_AXIS: lambda _: (
-        "the rig now turns about a second axis: restarting, to estimate the whole lever arm"
-    ),
-    Cause.COLUMNS_READ: lambda _: "the images show that the shutter reads columns: restarting with that",
+_CAUSES = {
+    Cause.NONE: "",
+    Cause.STORED_DIFFERS: "since the stored calibration",
+    Cause.BUMPED: "since before the bump",
+    Cause.IMAGES_REFUSED: "images no longer fit the motion, even after the pose was re-initialised",
+    Cause.IMAGES_DISAGREE: "images and motion disagree by more than before: the camera or the target moved, "
+    "or the lens changed",
+    Cause.ESTIMATE_IMPLAUSIBLE: "the estimate is not finite",
+    Cause.CALIBRATION_CONTRADICTED: "the last seconds move the calibration by more than the sigmas allow",
+    Cause.WINDOW_CONTRADICTED: "the last seconds do not fit the calibration; looking again",
+    Cause.NO_IMAGES: "no usable images for {:.1f} s",
+    Cause.CLOCK_SET: "the camera's clock was set",
+    Cause.INERTIAL_GAP: "inertial data have a gap",
+    Cause.TOO_FEW_FEATURES: "too few features can be followed",
+    Cause.FEATURES_CONTRADICT: "the features of the last seconds contradict each other",
+    Cause.FEATURES_MISS: "features are {:.1f} px from where they are expected",
+    Cause.INERTIAL_MISFIT: "inertial data and images disagree ({:.1f} times their noise)",
+    Cause.SCENE_MOVES: "{:.0%} of the features do not move with the scene",
+    Cause.NO_PARALLAX: "the camera stands still, everything is far away, or features are lost before they "
+    "show depth",
+    Cause.SECOND_AXIS: "the rig now turns about a second axis: restarting, to estimate the whole lever arm",
+    Cause.COLUMNS_READ: "the images show that the shutter reads columns: restarting with that",
 }
 
 
@@ -344,143 +337,104 @@ def _difference(what: str, factor: float, unit: str, form: str) -> Callable[[Eve
     return lambda e: f"{what} {_of(e, factor, unit, form)} {cause_text(e.cause)}".rstrip()
 
 
-_EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
-    EventKind.BUMPED: ("bumped: ", lambda e: cause_text(e.cause, e.cause_value)),
-    EventKind.STARTED_OVER: ("started over: ", lambda e: cause_text(e.cause, e.cause_value)),
-    EventKind.STARTED_ANEW: ("", lambda _: "restarted after the change"),
-    EventKind.NOT_BUMPED: (
-        "",
-        lambda e: (
-            "the mounting has not changed: the target was moved, or images were wrong "
-            f"(a camera that moved by more than {_of(e, 1e3, 'mm', '.1f')} would show)"
-        ),
+# before the name of the camera
+_LABELS = {
+    EventKind.BUMPED: "bumped: ",
+    EventKind.STARTED_OVER: "started over: ",
+    EventKind.CAMERA_MOVED: "changed: ",
+    EventKind.CAMERA_TURNED: "changed: ",
+    EventKind.TIMESHIFT_CHANGED: "changed: ",
+    EventKind.LENS_CHANGED: "changed: ",
+}
+_EVENTS: dict[EventKind, Callable[[Event], str]] = {
+    EventKind.BUMPED: lambda e: cause_text(e.cause, e.cause_value),
+    EventKind.STARTED_OVER: lambda e: cause_text(e.cause, e.cause_value),
+    EventKind.STARTED_ANEW: lambda _: "restarted after the change",
+    EventKind.NOT_BUMPED: lambda e: (
+        "the mounting has not changed: the target was moved, or images were wrong "
+        f"(a camera that moved by more than {_of(e, 1e3, 'mm', '.1f')} would show)"
     ),
-    EventKind.WENT_ON: ("", lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}"),
-    EventKind.RESUMED: (
-        "",
-        lambda e: f"resumed from the state of {_of(e, 1.0, 's', '.1f')} ago: the process was restarted",
+    EventKind.WENT_ON: lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}",
+    EventKind.RESUMED: lambda e: (
+        f"resumed from the state of {_of(e, 1.0, 's', '.1f')} ago: the process was restarted"
     ),
-    EventKind.CAMERA_MOVED: ("changed: ", _difference("moved by", 1e3, "mm", ".1f")),
-    EventKind.CAMERA_TURNED: ("changed: ", _difference("turned by", 180.0 / math.pi, "deg", ".2f")),
-    EventKind.TIMESHIFT_CHANGED: ("changed: ", _difference("time shift by", 1e3, "ms", "+.2f")),
-    EventKind.LENS_CHANGED: ("changed: ", _difference("lens by", 1.0, "px", ".2f")),
-    EventKind.STORED_HOLDS: (
-        "",
-        lambda e: f"the stored calibration holds, by {_of(e, 1.0, 's', '.0f')} of data",
+    EventKind.CAMERA_MOVED: _difference("moved by", 1e3, "mm", ".1f"),
+    EventKind.CAMERA_TURNED: _difference("turned by", 180.0 / math.pi, "deg", ".2f"),
+    EventKind.TIMESHIFT_CHANGED: _difference("time shift by", 1e3, "ms", "+.2f"),
+    EventKind.LENS_CHANGED: _difference("lens by", 1.0, "px", ".2f"),
+    EventKind.STORED_HOLDS: lambda e: f"the stored calibration holds, by {_of(e, 1.0, 's', '.0f')} of data",
+    EventKind.TIMESHIFT_STEPPED: lambda e: (
+        f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept"
     ),
-    EventKind.TIMESHIFT_STEPPED: (
-        "",
-        lambda e: f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept",
+    EventKind.LENS_STEPPED: lambda e: (
+        f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
+        "a lens that is not fixed is estimated again, all else is kept"
     ),
-    EventKind.LENS_STEPPED: (
-        "",
-        lambda e: (
-            f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
-            "a lens that is not fixed is estimated again, all else is kept"
-        ),
+    EventKind.POSE_LOST: lambda _: (
+        "the target was moved, or the pose was lost: it is found again, the calibration is kept"
     ),
-    EventKind.POSE_LOST: (
-        "",
-        lambda _: "the target was moved, or the pose was lost: it is found again, the calibration is kept",
+    EventKind.CLOCK_DRIFT: _drift(
+        "the time shift drifts: the clocks of camera and IMU run at different rates"
     ),
-    EventKind.CLOCK_DRIFT: (
-        "",
-        _drift("the time shift drifts: the clocks of camera and IMU run at different rates"),
+    EventKind.CLOCK_WANDER: lambda e: (
+        "the time shift is not constant: it stepped, or the clocks of camera and IMU changed their "
+        f"rates, which now differ by {_of(e, 1e6, 'us a second', '+.1f')}; the drift is now estimated too"
     ),
-    EventKind.CLOCK_WANDER: (
-        "",
-        lambda e: (
-            "the time shift is not constant: it stepped, or the clocks of camera and IMU changed their "
-            f"rates, which now differ by {_of(e, 1e6, 'us a second', '+.1f')}; the drift is now estimated too"
-        ),
+    EventKind.STAMP_JITTER: lambda e: (
+        f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for"
     ),
-    EventKind.STAMP_JITTER: (
-        "",
-        lambda e: f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for",
+    EventKind.STAMPED_ON_ARRIVAL: lambda e: (
+        f"its stamps jitter by {_of(e, 1e3, 'ms', '.1f')} but it samples evenly: its images are put on "
+        "an even grid from now on; the calibration starts over"
     ),
-    EventKind.STAMPED_ON_ARRIVAL: (
-        "",
-        lambda e: (
-            f"its stamps jitter by {_of(e, 1e3, 'ms', '.1f')} but it samples evenly: its images are put on "
-            "an even grid from now on; the calibration starts over"
-        ),
+    EventKind.IMAGES_WANDER: lambda e: (
+        f"whole images move by {_of(e, 1.0, 'px', '.1f')} against the motion of the IMU: switch off "
+        "image stabilisation; lens, camera and board must not move on their own"
     ),
-    EventKind.IMAGES_WANDER: (
-        "",
-        lambda e: (
-            f"whole images move by {_of(e, 1.0, 'px', '.1f')} against the motion of the IMU: switch off "
-            "image stabilisation; lens, camera and board must not move on their own"
-        ),
+    EventKind.STAMPS_STEPPED: lambda e: (
+        f"its stamps stepped by about {_of(e, 1.0, 's', '+.1f')} against those of the IMU"
     ),
-    EventKind.STAMPS_STEPPED: (
-        "",
-        lambda e: f"its stamps stepped by about {_of(e, 1.0, 's', '+.1f')} against those of the IMU",
+    EventKind.IMU_CLOCK_SET_BACK: lambda e: (
+        f"the IMU's stamps went back by {_of(e, 1.0, 's', '.1f')}: its clock was set"
     ),
-    EventKind.IMU_CLOCK_SET_BACK: (
-        "",
-        lambda e: f"the IMU's stamps went back by {_of(e, 1.0, 's', '.1f')}: its clock was set",
+    EventKind.IMU_CLOCK_REMAPPED: lambda e: (
+        f"the IMU's stamps moved by {_of(e, 1e3, 'ms', '+.1f')}: its driver mapped the clock again; "
+        "corrected for"
     ),
-    EventKind.IMU_CLOCK_REMAPPED: (
-        "",
-        lambda e: (
-            f"the IMU's stamps moved by {_of(e, 1e3, 'ms', '+.1f')}: its driver mapped the clock again; "
-            "corrected for"
-        ),
+    EventKind.IMU_GAP: lambda e: f"{_of(e, 1.0, 's', '.1f')} without inertial data",
+    EventKind.IMU_REPEATED: lambda e: f"{_of(e, 1.0, 's', '.1f')} in which the IMU repeated one reading",
+    EventKind.IMU_CLIPPED: lambda e: (
+        f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU: move the rig more gently"
     ),
-    EventKind.IMU_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without inertial data"),
-    EventKind.IMU_REPEATED: (
-        "",
-        lambda e: f"{_of(e, 1.0, 's', '.1f')} in which the IMU repeated one reading",
+    EventKind.IMAGE_GAP: lambda e: f"{_of(e, 1.0, 's', '.1f')} without images",
+    EventKind.IMAGE_REPEATED: lambda e: f"{_of(e, 1.0, 's', '.1f')} in which one image was repeated",
+    EventKind.IMU_NOISE: _imu_noise,
+    EventKind.IMU_INTRINSICS: lambda e: (
+        f"scale or alignment of the IMU is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
     ),
-    EventKind.IMU_CLIPPED: (
-        "",
-        lambda e: (
-            f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU: "
-            "move the rig more gently"
-        ),
+    EventKind.ACCEL_LAG: _accel_lag,
+    EventKind.ACCEL_POSITIONS: lambda e: (
+        "the axes of the accelerometer are not in one place (size effect), by "
+        f"{_size(e, 1e3, 'mm', '.1f')}: allowed for from now on"
     ),
-    EventKind.IMAGE_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without images"),
-    EventKind.IMAGE_REPEATED: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} in which one image was repeated"),
-    EventKind.IMU_NOISE: ("", _imu_noise),
-    EventKind.IMU_INTRINSICS: (
-        "",
-        lambda e: (
-            f"scale or alignment of the IMU is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
-        ),
+    EventKind.TARGET_SIZE: _target_size,
+    EventKind.TARGET_RATIO: _target_ratio,
+    EventKind.TARGET_SHAPE: lambda e: (
+        f"the target differs from its file by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
+        "its shape is estimated from now on"
     ),
-    EventKind.ACCEL_LAG: ("", _accel_lag),
-    EventKind.ACCEL_POSITIONS: (
-        "",
-        lambda e: (
-            "the axes of the accelerometer are not in one place (size effect), by "
-            f"{_size(e, 1e3, 'mm', '.1f')}: allowed for from now on"
-        ),
+    EventKind.FIXED_LENS: lambda e: (
+        f"the fixed lens is not this camera's: points appear {_of(e, 1.0, 'px', '.1f')} (RMS) from where "
+        "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated"
     ),
-    EventKind.TARGET_SIZE: ("", _target_size),
-    EventKind.TARGET_RATIO: ("", _target_ratio),
-    EventKind.TARGET_SHAPE: (
-        "",
-        lambda e: (
-            f"the target differs from its file by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
-            "its shape is estimated from now on"
-        ),
+    EventKind.ROLLING_SHUTTER: _rolling,
+    EventKind.ROLLING_COLUMNS: _rolling,
+    EventKind.LENS_TERM_MISSING: lambda _: (
+        "the lens needs one term more than radtan has: give it distortion_model: plumb_bob"
     ),
-    EventKind.FIXED_LENS: (
-        "",
-        lambda e: (
-            f"the fixed lens is not this camera's: points appear {_of(e, 1.0, 'px', '.1f')} (RMS) from where "
-            "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated"
-        ),
-    ),
-    EventKind.ROLLING_SHUTTER: ("", _rolling),
-    EventKind.ROLLING_COLUMNS: ("", _rolling),
-    EventKind.LENS_TERM_MISSING: (
-        "",
-        lambda _: "the lens needs one term more than radtan has: give it distortion_model: plumb_bob",
-    ),
-    EventKind.DEVICE_REPLACED: ("", lambda e: e.said),
-    EventKind.ESTIMATOR_RESTARTED: ("", lambda e: e.said),
-    EventKind.OTHER: ("", lambda e: e.said),
+    EventKind.DEVICE_REPLACED: lambda e: e.said,
+    EventKind.ESTIMATOR_RESTARTED: lambda e: e.said,
+    EventKind.OTHER: lambda e: e.said,
 }
 
 

@@ -254,19 +254,27 @@ def _grid_of(
 def _slots(t_s: FloatArray, period_s: float) -> IntArray:
     """Number on the grid of each image of one piece, shape (n,), strictly increasing."""
     times = t_s.tolist()  # each place follows from those before: arrays would take three times as long
-    slots, late_s = [0] * len(times), [0.0] * len(times)
-
-    def place(k: int, earliest_s: float, before: float) -> None:
-        slots[k] = int(min(math.floor((times[k] - earliest_s) / period_s + 1.0 - _SLOT), before))
-        late_s[k] = times[k] - slots[k] * period_s
-
-    for k in range(len(times)):
-        place(k, min(late_s[max(k - _BLOCK, 0) : k]) if k else times[0], math.inf)
+    count, slots, late_s = len(times), [0] * len(times), [0.0] * len(times)
+    earliest_s = times[0]  # of the block before an image
+    for k, time_s in enumerate(times):
+        slots[k] = math.floor((time_s - earliest_s) / period_s + 1.0 - _SLOT)
+        late_s[k] = time_s - slots[k] * period_s
+        if k == 0 or late_s[k] <= earliest_s:
+            earliest_s = late_s[k]
+        elif k >= _BLOCK and late_s[k - _BLOCK] == earliest_s:
+            earliest_s = min(late_s[k - _BLOCK + 1 : k + 1])
     # The first ones may all have been late, and a late image takes the place before the next one.
-    for k in range(len(times) - 2, -1, -1):
-        behind = late_s[k + 1 : k + 1 + _BLOCK]
-        about = behind if len(behind) == _BLOCK else late_s[max(k - _BLOCK, 0) : k + 1]
-        place(k, min(about), slots[k + 1] - 1)
+    for k in range(count - 2, -1, -1):
+        last = k + _BLOCK  # of the block behind the image
+        if last >= count:
+            earliest_s = min(late_s[max(k - _BLOCK, 0) : k + 1])
+        elif last == count - 1 or late_s[last + 1] == earliest_s:
+            earliest_s = min(late_s[k + 1 : last + 1])
+        else:
+            earliest_s = min(earliest_s, late_s[k + 1])
+        place = math.floor((times[k] - earliest_s) / period_s + 1.0 - _SLOT)
+        slots[k] = min(place, slots[k + 1] - 1)
+        late_s[k] = times[k] - slots[k] * period_s
     return np.array(slots, dtype=np.int64)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from pathlib import Path
 
 import pytest
 
-from vical_daemon.estimation.events import REFERENCE, Cause, Event, EventKind, EventLog
+from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection, of_camera
 from vical_daemon.estimation.wording import (
     cause_text,
@@ -20,17 +22,25 @@ from vical_daemon.estimation.wording import (
     guidance_text,
 )
 
+PAGE = (Path(__file__).parents[3] / "docs/reference/events.md").read_text(encoding="utf-8")
+ROWS = {row[0]: row[1:] for row in re.findall(r"^\| `(\w+)` \| (.*) \| (\S+) \| (.*) \|$", PAGE, re.M)}
+
+
+def test_the_page_lists_these_kinds_and_no_others():
+    assert sorted(ROWS) == sorted(EventKind)
+
 
 @pytest.mark.parametrize("kind", EventKind)
 def test_every_kind_is_explained_and_has_one_line(kind):
-    about = REFERENCE[kind]
-    assert about.meaning.endswith(".") and about.when.endswith(".")
+    meaning, unit, when = ROWS[kind]
+    assert meaning.endswith(".") and when.endswith(".")
+    has_unit = unit != "none"
     for value, sigma in ((None, None), (1e-3, None), (-1e-3, 2e-4)):
         event = Event(kind, "cam0", value, sigma, said="text")
         line = event_text(event)
         assert "cam0: " in line and "\n" not in line
-        assert (value is None or sigma is None or not about.unit) or "± " in line
-        assert ("nan" in line) <= bool(about.unit and value is None), line
+        assert (value is None or sigma is None or not has_unit) or "± " in line
+        assert ("nan" in line) <= (has_unit and value is None), line
         assert json.loads(json.dumps(event_document(event)))["text"] == line
 
 

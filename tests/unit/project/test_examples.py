@@ -87,7 +87,7 @@ def reference():
 def test_reference_pages_cover_the_code(reference):
     from vical_daemon.bus import topics
     from vical_daemon.cli import table
-    from vical_daemon.estimation.events import Cause, EventKind
+    from vical_daemon.estimation.events import Cause
 
     keys = reference.topics_table()
     assert all(topic.pattern in keys for topic in topics.TOPICS)
@@ -96,8 +96,6 @@ def test_reference_pages_cover_the_code(reference):
         assert key in settings
     commands = reference.commands_text()
     assert all(f"## vical {name}" in commands for name in table.available())
-    events = reference.events_table()
-    assert all(f"| `{kind}` |" in events for kind in EventKind)
     assert all(f"| `{cause}` |" in reference.causes_table() for cause in Cause if cause)
     modules = reference.modules_text()
     assert "`vical_drivers.clock`" in modules

@@ -126,16 +126,19 @@ def test_ci_raises_deprecations_and_sets_the_usual_limits():
     assert run("bash", "-n", ".ci/run").returncode == 0
 
 
-@pytest.mark.parametrize(("failing", "code"), [("none", 0), ("check", 1), ("test", 1)])
-def test_ci_checks_next_to_the_tests_and_fails_with_either(failing, code):
-    """With a `make` that only says what it is to do."""
+@pytest.mark.parametrize(("failing", "code"), [("none", 0), ("check", 1), ("test", 1), ("root", 1)])
+def test_ci_checks_next_to_the_tests_and_fails_with_any(failing, code):
+    """With a `make` that only says what it is to do. Root comes last: where it writes, nobody else may."""
     functions = re.findall(r"^\w+\(\) \{.*?^\}$", (ROOT / ".ci/run").read_text(), re.M | re.S)
     stub = f'make() {{ echo "make $1"; sleep 0.2; [[ $1 != {failing} ]]; }}'
-    done = run("bash", "-euo", "pipefail", "-c", "\n".join([*functions, "settings=()", stub, "run_all"]))
+    root = f"root_tests() {{ echo 'root tests'; [[ root != {failing} ]]; }}"
+    words = [*functions, "settings=()", stub, root, 'as_user() { "$@"; }', "run_all as_user"]
+    done = run("bash", "-euo", "pipefail", "-c", "\n".join(words))
     assert done.returncode == code, done.stderr
     said = done.stdout.split("\n")
     assert said[0] == "make .venv/.check"  # one pip at a time, and before anything uses what it changes
     assert {"make check", "make test"} <= set(said)
+    assert said.index("make check") < said.index("root tests")
     assert ("make check FAILED; the tests go on" in said) == (failing == "check")
 
 

@@ -41,7 +41,7 @@ def hat(v: FloatArray) -> FloatArray:
     return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
 
 
-def _polynomial(alpha: FloatArray, beta: FloatArray, gamma: FloatArray, v: FloatArray) -> FloatArray:
+def polynomial(alpha: FloatArray, beta: FloatArray, gamma: FloatArray, v: FloatArray) -> FloatArray:
     """Return `alpha I + beta hat(v) + gamma v v'`, the form of all functions of hat(v)."""
     out = ((beta[..., None] * v) @ _SKEW).reshape(*v.shape, 3)
     out += (gamma[..., None] * v)[..., :, None] * v[..., None, :]
@@ -63,7 +63,7 @@ def exp(rotvec: FloatArray) -> FloatArray:
     half = 0.5 * np.sqrt(angle2 + _NO_ANGLE)
     half_sinc = np.sin(half) / half
     gamma = 0.5 * half_sinc * half_sinc  # (1 - cos) / angle^2 without cancellation
-    return _polynomial(1.0 - gamma * angle2, half_sinc * np.cos(half), gamma, v)
+    return polynomial(1.0 - gamma * angle2, half_sinc * np.cos(half), gamma, v)
 
 
 def exp_one(rotvec: FloatArray) -> FloatArray:
@@ -72,13 +72,17 @@ def exp_one(rotvec: FloatArray) -> FloatArray:
     angle2 = x * x + y * y + z * z
     half = 0.5 * math.sqrt(angle2 + _NO_ANGLE)
     half_sinc = math.sin(half) / half
-    c, s = 0.5 * half_sinc * half_sinc, math.sin(2.0 * half) / (2.0 * half)
-    w = 1.0 - c * angle2
+    return rotation_one(x, y, z, math.sin(2.0 * half) / (2.0 * half), 0.5 * half_sinc * half_sinc)
+
+
+def rotation_one(x: float, y: float, z: float, beta: float, gamma: float) -> FloatArray:
+    """`polynomial` of one vector where it is a rotation: alpha = 1 - gamma v'v."""
+    w = 1.0 - gamma * (x * x + y * y + z * z)
     return np.array(
         [
-            [w + c * x * x, c * x * y - s * z, c * x * z + s * y],
-            [c * x * y + s * z, w + c * y * y, c * y * z - s * x],
-            [c * x * z - s * y, c * y * z + s * x, w + c * z * z],
+            [w + gamma * x * x, gamma * x * y - beta * z, gamma * x * z + beta * y],
+            [gamma * x * y + beta * z, w + gamma * y * y, gamma * y * z - beta * x],
+            [gamma * x * z - beta * y, gamma * y * z + beta * x, w + gamma * z * z],
         ]
     )
 
@@ -222,7 +226,7 @@ def right_jacobian(rotvec: FloatArray) -> FloatArray:
     small = angle < _SERIES_BELOW_RAD
     series = 1 / 6 + a2 * (-1 / 120 + a2 * (1 / 5040 + a2 * (-1 / 362880 + a2 / 39916800)))
     gamma = np.where(small, series, (1.0 - sinc) / np.where(small, 1.0, a2))
-    return _polynomial(sinc, -0.5 * half_sinc * half_sinc, gamma, v)
+    return polynomial(sinc, -0.5 * half_sinc * half_sinc, gamma, v)
 
 
 def right_jacobian_inverse(rotvec: FloatArray) -> FloatArray:
@@ -242,7 +246,7 @@ def right_jacobian_inverse(rotvec: FloatArray) -> FloatArray:
     series = 1 / 12 + a2 * (1 / 720 + a2 * (1 / 30240 + a2 * (1 / 1209600 + a2 / 47900160)))
     alpha = np.where(small, 1.0 - series * a2, safe * np.cos(safe) / np.sin(safe))
     gamma = np.where(small, series, (1.0 - alpha) / np.where(small, 1.0, a2))
-    return _polynomial(alpha, np.full_like(alpha, 0.5), gamma, v)
+    return polynomial(alpha, np.full_like(alpha, 0.5), gamma, v)
 
 
 def tangents(unit: FloatArray) -> FloatArray:

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
-from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
@@ -327,20 +327,8 @@ def rotation_from_grp(p: FloatArray) -> FloatArray:
     m = 0.25 * p
     s = np.vecdot(m, m)
     d = 1.0 / (1.0 + s) ** 2
-    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
-    out: FloatArray = (b[..., None] * m)[..., :, None] * m[..., None, :]
-    diagonal = 1.0 - b * s
-    am = a[..., None] * m
-    out[..., 0, 0] += diagonal
-    out[..., 1, 1] += diagonal
-    out[..., 2, 2] += diagonal
-    out[..., 2, 1] += am[..., 0]
-    out[..., 1, 2] -= am[..., 0]
-    out[..., 0, 2] += am[..., 1]
-    out[..., 2, 0] -= am[..., 1]
-    out[..., 1, 0] += am[..., 2]
-    out[..., 0, 1] -= am[..., 2]
-    return out
+    gamma = 8.0 * d
+    return so3.polynomial(1.0 - gamma * s, 4.0 * (1.0 - s) * d, gamma, m)
 
 
 def rotation_of_grp(p: FloatArray) -> FloatArray:
@@ -348,15 +336,7 @@ def rotation_of_grp(p: FloatArray) -> FloatArray:
     x, y, z = (0.25 * p).tolist()
     s = x * x + y * y + z * z
     d = 1.0 / (1.0 + s) ** 2
-    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
-    w = 1.0 - b * s
-    return np.array(
-        [
-            [w + b * x * x, b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, w + b * y * y, b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, w + b * z * z],
-        ]
-    )
+    return so3.rotation_one(x, y, z, 4.0 * (1.0 - s) * d, 8.0 * d)
 
 
 def grp_from_rotation(R: FloatArray) -> FloatArray:
@@ -372,7 +352,7 @@ def grp_from_rotation(R: FloatArray) -> FloatArray:
 
 def tilt_basis(gravity: FloatArray) -> FloatArray:
     """Two unit vectors across gravity to begin with, shape (3, 2): the directions in which it can tilt."""
-    basis: FloatArray = tangents(gravity[None] / np.sqrt(gravity @ gravity))[0]
+    basis: FloatArray = so3.tangents(gravity[None] / np.sqrt(gravity @ gravity))[0]
     return basis
 
 

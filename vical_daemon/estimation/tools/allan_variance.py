@@ -24,16 +24,13 @@ class TooShortError(ValueError):
     """The recording holds too few samples for an Allan analysis; the message says how many are needed."""
 
 
-def allan_deviation(
-    signal: FloatArray, rate_hz: float, factors: IntArray, *, overlapping: bool = True
-) -> FloatArray:
-    """Return the Allan deviation at averaging times factors / rate_hz.
+def allan_deviation(signal: FloatArray, rate_hz: float, factors: IntArray) -> FloatArray:
+    """Return the Allan deviation at averaging times factors / rate_hz, of all overlapping clusters.
 
     Args:
         signal: Rate-like signal at rest (angular rate, specific force), evenly sampled, shape (n,).
         rate_hz: Sampling rate, Hz.
         factors: Averaging factors, shape (k,).
-        overlapping: All overlapping clusters (better) or only adjacent ones (the classic definition).
 
     Returns:
         Allan deviation in the unit of the signal, shape (k,).
@@ -52,8 +49,7 @@ def allan_deviation(
     deviation = np.empty(len(factors))
     for k, factor in enumerate(int(f) for f in factors):
         second = phase[2 * factor :] - 2.0 * phase[factor:-factor] + phase[: -2 * factor]
-        used = second if overlapping else second[::factor]
-        deviation[k] = np.sqrt(0.5 * np.mean(used**2)) / factor
+        deviation[k] = np.sqrt(0.5 * np.mean(second**2)) / factor
     return deviation
 
 

@@ -43,7 +43,6 @@ UNITS = {
     "accel_matrix": 0.01,
     "target_scale": 0.01,
     "readout": 0.002,
-    "landmark": 0.05,
 }
 
 _LOST = 1e-7  # singular value (in the units above, relative to the largest) below which a direction is lost
@@ -82,7 +81,6 @@ class Setup:
         model: radtan or equidistant.
         resolution: width, height, px; points outside are not seen.
         landmarks_m: Points in the world, m, shape (n, 3).
-        target_free: The points' places are unknown too.
         seen: Without a board, in a world with z up: rows of `landmarks_m` that each image shows. Their places
             are unknown, and eliminated. None: the points inside of the image are seen.
         readout_axis: What a rolling shutter reads one after the other.
@@ -97,7 +95,6 @@ class Setup:
     landmarks_m: FloatArray
     model: str = "radtan"
     resolution: tuple[int, int] = (640, 480)
-    target_free: bool = False
     estimate: frozenset[str] = frozenset()
     corner_sigma_px: float = 0.5
     seen: tuple[npt.NDArray[np.intp], ...] | None = None
@@ -116,8 +113,6 @@ def block_layout(setup: Setup) -> dict[str, slice]:
         sizes += [("target_scale", 1)]
     if "readout" in setup.estimate:
         sizes += [("readout", 1)]
-    if setup.target_free:
-        sizes += [("landmark", 3 * len(setup.landmarks_m))]
     layout, start = {}, 0
     for name, size in sizes:
         layout[name] = slice(start, start + size)
@@ -290,10 +285,6 @@ def _frame_jacobian(
         dX[:, :, layout["readout"]] += (flow * row[:, None])[:, :, None]
     if "target_scale" in layout:
         dX[:, :, layout["target_scale"]] += (landmarks[ids] @ R_cam_world.T)[:, :, None]
-    if "landmark" in layout:
-        first = layout["landmark"].start
-        for i, point in enumerate(ids):
-            dX[i, :, first + 3 * point : first + 3 * point + 3] += R_cam_world
     J = J_point[ids] @ dX
     if "intrinsics" in layout:
         J[:, :, layout["intrinsics"]] += J_lens[ids, :, :4]
@@ -333,7 +324,7 @@ def _parts(vector: FloatArray, layout: dict[str, slice]) -> list[tuple[str, floa
     return sorted(((n, s) for n, s in shares if s > 0.05), key=lambda part: -part[1])
 
 
-def covariance_of(result: Observability, prior: float = 1e3) -> FloatArray:
+def covariance_of(result: Observability, prior: float) -> FloatArray:
     """Return the covariance of all unknowns with next to no prior, so that lost directions stay finite.
 
     Args:

@@ -14,11 +14,6 @@ def nbs14(count: int) -> np.ndarray:
     return np.array(numbers) / 2147483647.0
 
 
-def test_nbs14_reference_values_of_the_classic_allan_deviation():
-    found = noise.allan_deviation(nbs14(1000), 1.0, np.array([1, 10, 100]), overlapping=False)
-    assert found == pytest.approx([0.2922319, 0.09965736, 0.03897804], rel=5e-7)
-
-
 def test_nbs14_reference_values_of_the_overlapping_deviation():
     found = noise.allan_deviation(nbs14(1000), 1.0, np.array([1, 10, 100]))
     assert found == pytest.approx([0.2922319, 0.09159953, 0.03241343], rel=5e-7)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project
 from vical_daemon.estimation.guidance import Block, Lack, Verb
 from vical_daemon.estimation.measurements import ConvergenceTargets
 from vical_daemon.estimation.status.excitation import (
@@ -17,6 +18,8 @@ from vical_daemon.estimation.status.excitation import (
 from vical_daemon.estimation.tools.observability import (
     Motion,
     Setup,
+    _frame_jacobian,
+    block_layout,
     gramian,
     pose_sensitivities,
 )
@@ -129,10 +132,10 @@ def test_optional_blocks_are_judged_too():
     every = frozenset({"intrinsics", "imu_matrix", "target_scale", "readout"})
     result = gramian(_motion("general"), _setup(estimate=every), FRAMES)
     assert result.unknowns == 50
-    free = gramian(_motion("general", 6.0), _setup(target_free=True), FRAMES[:50])
-    # board-free: three of position, three of the world's turn (gravity's direction is an unknown), no others
-    assert free.unknowns - free.rank in (6, 7)
-    assert not np.isfinite(free.sigma[free.blocks["position"]]).any()
+    seen = tuple(np.arange(20) for _ in range(50))
+    free = gramian(_motion("general", 6.0), _setup(seen=seen), FRAMES[:50])
+    # board-free: position, attitude and the size of gravity are no unknowns, all others are determined
+    assert free.rank == free.unknowns == 25 - 7
     assert np.isfinite(free.sigma[free.blocks["rotation"]]).all()
 
 
@@ -268,17 +271,41 @@ def test_a_poor_motion_is_told_as_a_whole(rate, said):
     assert bool(words) == bool(said)
 
 
+def full_information(motion, setup, frames):
+    """Of the unknowns and then of the places of all points; the derivatives by these from differences."""
+    layout, n, h = block_layout(setup), len(setup.landmarks_m), 1e-6
+    p = max(columns.stop for columns in layout.values())
+    theta, _, position = pose_sensitivities(motion, layout, p)
+    information = np.zeros((p + 3 * n, p + 3 * n))
+
+    def pixels(points, k):
+        in_imu = (points - motion.p_world_imu[k]) @ motion.R_world_imu[k]
+        in_cam = (in_imu - setup.p_imu_cam) @ setup.R_imu_cam
+        return project(in_cam, setup.intrinsics, setup.distortion, setup.model)
+
+    for k in frames:
+        ids, J = _frame_jacobian(motion, setup, layout, k, theta[k], position[k])
+        by_place = np.zeros((len(ids), 2, n, 3))
+        for axis, step in enumerate(h * np.eye(3)):
+            points = setup.landmarks_m[ids]
+            slope = (pixels(points + step, k) - pixels(points - step, k)) / (2.0 * h)
+            by_place[np.arange(len(ids)), :, ids, axis] = slope
+        whole = np.concatenate([J, by_place.reshape(len(J), 3 * n)], axis=1)
+        information += whole.T @ whole
+    return information / setup.corner_sigma_px**2, layout
+
+
 def test_points_of_unknown_place_are_eliminated_as_in_the_full_information():
     motion, frames = _motion("general", 4.0), FRAMES[:30]
-    full = gramian(motion, _setup(target_free=True), frames)
+    A, blocks = full_information(motion, _setup(), frames)
     points = len(_setup().landmarks_m)
     seen = tuple(np.arange(points) for _ in frames)
     found = gramian(motion, _setup(seen=seen), frames)
     chosen = [name for name in found.blocks if name != "gravity"]
-    columns = np.concatenate([np.r_[full.blocks[name]] for name in chosen])
-    gravity = np.r_[full.blocks["gravity"]][:2]
+    columns = np.concatenate([np.r_[blocks[name]] for name in chosen])
+    gravity = np.r_[blocks["gravity"]][:2]
     order = np.concatenate([np.r_[found.blocks[name]] for name in chosen] + [np.r_[found.blocks["gravity"]]])
-    A, marks = full.information, np.r_[full.blocks["landmark"]]
+    marks = np.arange(len(A) - 3 * points, len(A))
     at = np.concatenate([columns, gravity])
     seen_often = np.diag(A)[marks] > 0.0
     marks = marks[seen_often]
