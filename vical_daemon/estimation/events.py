@@ -286,8 +286,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.IMU_CLOCK_REMAPPED: About(
         "The driver mapped the IMU's clock again; the time shift follows. Value: step.",
         "s",
-        "When 4 even readings have followed the step. Smaller ones than 6 of the driver's "
-        "stated sigmas are added up until they exceed it.",
+        "When 4 even readings have followed the step, if it exceeds 6 of the driver's stated sigmas.",
     ),
     EventKind.IMU_GAP: About(
         "Inertial readings were missing. Value: for how long.",
