@@ -34,8 +34,8 @@ _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
 _KEYS = 512
 _OF_LIMIT = 0.75
-"""Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The rest
-is for what comes before the next look, 0.1 s, an open chunk of 1 MB, index and attachments."""
+"""Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The
+rest is for what comes before the next look, 0.1 s, an open chunk of 1 MB, index and attachments."""
 _REPORTS = 32  # log lines about malformed messages and unknown commands
 _ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
 
