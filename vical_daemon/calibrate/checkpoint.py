@@ -29,10 +29,10 @@ from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.service.atomic_file import atomic_write
+from vical_daemon.service.claims import job_name
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
-FILE_NAME = "estimator"
 SAVE_EVERY_S = 2.0
 PROVEN_S = 10.0  # an estimator is not saved before it has run this long without failing
 OLDEST_S = 300.0  # after this long the rig may have been touched
@@ -51,6 +51,11 @@ _PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), (
     )
 }
 """Types in a state, besides the classes of the estimation."""
+
+
+def file_name(config: Config) -> str:
+    """Name of the file: rigs that share a folder, and processes for other cameras, have their own."""
+    return f"{job_name(config, 'estimate', config.calibration_cameras[0])}.state"
 
 
 class _Head(msgspec.Struct, frozen=True):
@@ -85,7 +90,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: Path | None, config: Config, clock: WallClock) -> None:
-        self._path = None if folder is None else folder / FILE_NAME
+        self._path = None if folder is None else folder / file_name(config)
         self._clock = clock
         self._identity = _identity(config, clock)
         self._next_s = time.monotonic() + PROVEN_S

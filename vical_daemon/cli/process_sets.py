@@ -63,6 +63,8 @@ def needed_processes(config: Config) -> list[str]:
     return needed
 
 
+_importing = threading.Lock()
+"""One role at a time: two threads that each import what the other is importing end in a deadlock error."""
 STOP_S = 10.0
 PATIENCE_S: dict[str, float] = {"estimate": 30.0}
 """How long a role may take to stop: the estimator ends the step it is in, which a busy machine stretches."""
@@ -92,7 +94,8 @@ class RoleThreads:
 
         def guarded() -> None:
             try:
-                run = import_module(ROLE_MODULES[role]).run  # loads scipy, OpenCV: for a minute
+                with _importing:
+                    run = import_module(ROLE_MODULES[role]).run  # loads scipy, OpenCV: for a minute
                 run(self._config, self._bus, stop, **(options or {}))
             except Exception as error:
                 self.errors[role] = error

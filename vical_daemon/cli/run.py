@@ -6,7 +6,6 @@ import argparse
 import gc
 import logging
 import os
-import re
 import sys
 import threading
 import time
@@ -74,15 +73,12 @@ def _claims(config: Config, roles: list[str], stop: threading.Event) -> Claims:
         CliError: Another process does it.
     """
     from vical_daemon.config.paths import make_private, runtime_directory
-    from vical_daemon.service.claims import ClaimedError, Claims
+    from vical_daemon.service.claims import ClaimedError, Claims, job_name
 
     cameras = list(config.cameras)
     devices = {"imu": list(config.imus), "camera": cameras, "detect": cameras, "estimate": cameras}
-    bus = "" if config.bus.socket is None else re.sub(r"\W+", ".", config.bus.socket)  # may share a folder
     names = {
-        f"{config.rig}.{role}.{device}{bus}": (role, device)
-        for role in roles
-        for device in devices.get(role, [])
+        job_name(config, role, device): (role, device) for role in roles for device in devices.get(role, [])
     }
     try:
         return Claims(make_private(runtime_directory()), names, _CLAIM_S, stop)

@@ -161,6 +161,10 @@ class LogRecording(Recording):
     def _raw(self) -> Iterator[RawMessage]:
         """Yield all messages in the order of the log, as CDR."""
 
+    def as_written(self) -> Iterator[RawMessage]:
+        """Yield all messages in the order of the log, with the stamps that they were recorded with."""
+        return self._raw()
+
     def _scan(self) -> None:
         for raw in self._raw():
             channel = self._channels.get(raw.topic) or self._meet(raw)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.logs.mcap import LogReader
 from vical_daemon.logs.model import Recording
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.recorded_logs import LogRecording, stamp_of
 
 _PERIODIC_HZ = 0.5
 _SAME_CLOCK_MS = 3_600_000.0
@@ -30,8 +30,8 @@ class TopicSummary:
         missing: Messages that are missing in these gaps.
         largest_gap_s: The longest interval.
         jitter_us: Spread (1.4826 times the median deviation) of the intervals.
-        latency_ms: Median and 99th percentile of arrival minus stamp; None where arrival is not
-            known, or by another clock.
+        latency_ms: Median and 99th percentile of arrival minus stamp; None where a message has no stamp,
+            or its arrival is not known or by another clock.
         bytes: Of the payloads.
         disordered: Messages whose stamp lies before that of an earlier one.
     """
@@ -71,6 +71,18 @@ class _Tally:
     stamps: array[int] = field(default_factory=lambda: array("q"))
     arrivals: array[int] = field(default_factory=lambda: array("q"))
     bytes: int = 0
+    stamped: bool = True  # every message
+
+
+def _take(tally: _Tally, payload: bytes, log_time_ns: int, *, has_header: bool = True) -> None:
+    """Take a message; without a stamp of its own it counts as stamped when it was recorded."""
+    stamp_ns = stamp_of(payload) if has_header else None
+    # TFMessage and String do not start with a stamp
+    plausible = stamp_ns is not None and abs(stamp_ns - log_time_ns) < 10**18
+    tally.stamped &= plausible
+    tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(log_time_ns))
+    tally.arrivals.append(_fit(log_time_ns))
+    tally.bytes += len(payload)
 
 
 def summarise_logs(path: Path, files: list[Path]) -> Summary:
@@ -91,12 +103,7 @@ def summarise_logs(path: Path, files: list[Path]) -> Summary:
             tally = tallies.get(channel.topic)
             if tally is None:
                 tally = tallies[channel.topic] = _Tally(channel.type_name)
-            stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
-            # TFMessage and String do not start with a stamp
-            plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
-            tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
-            tally.arrivals.append(_fit(message.log_time_ns))
-            tally.bytes += len(message.payload)
+            _take(tally, message.payload, message.log_time_ns, has_header=channel.encoding == "cdr")
     metadata = {name: values for reader in readers for name, values in reader.metadata}
     attachments = {item.name: len(item.data) for reader in readers for item in reader.attachments}
     warnings = [warning for reader in readers for warning in reader.warnings]
@@ -105,13 +112,18 @@ def summarise_logs(path: Path, files: list[Path]) -> Summary:
 
 
 def summarise_recording(recording: Recording) -> Summary:
-    """Summarise any other recording: its sensors."""
+    """Summarise any other recording: its sensors; of a bag with their latency."""
     topics = {stream.key: _source(recording.path, stream.source) for stream in recording.streams}
     tallies = {topics[stream.key]: _Tally(stream.kind) for stream in recording.streams}
-    for key, payload in recording.messages(recording.streams):
-        tally = tallies[topics[key]]
-        tally.stamps.append(stamp_of(payload) or 0)
-        tally.bytes += len(payload)
+    if isinstance(recording, LogRecording):
+        for message in recording.as_written():
+            if message.topic in tallies:
+                _take(tallies[message.topic], message.payload, message.log_time_ns)
+    else:
+        for key, payload in recording.messages(recording.streams):
+            tally = tallies[topics[key]]
+            tally.stamps.append(stamp_of(payload) or 0)
+            tally.bytes += len(payload)
     return _summary(recording.path, tallies, list(recording.warnings), True, {}, {})
 
 
@@ -163,7 +175,7 @@ def _topic(name: str, tally: _Tally) -> TopicSummary:
         gaps, missing = len(holes), int(np.round(holes * rate_hz - 1).sum())
     jitter_us = 1.4826e6 * float(np.median(np.abs(steps_s - median_s))) if len(steps_s) else 0.0
     latency = None
-    if len(tally.arrivals):
+    if tally.stamped and len(tally.arrivals):
         delays_ms = (np.array(tally.arrivals, dtype=np.int64) - raw) * 1e-6
         if abs(float(np.median(delays_ms))) < _SAME_CLOCK_MS:
             latency = (float(np.median(delays_ms)), float(np.percentile(delays_ms, 99)))

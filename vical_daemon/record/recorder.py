@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import resource
 import threading
 from importlib.metadata import PackageNotFoundError, version
 
@@ -32,6 +33,9 @@ _log = logging.getLogger(__name__)
 _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
 _KEYS = 512
+_OF_LIMIT = 0.75
+"""Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The
+rest is for what comes before the next look, 0.1 s, an open chunk of 1 MB, index and attachments."""
 _REPORTS = 32  # log lines about malformed messages and unknown commands
 _ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
 
@@ -196,13 +200,25 @@ class Recorder:
         record = self._config.record
         self._session = LogSession(
             self._folder, self._config.rig, now_ns,
-            rotate_s=record.rotate_s, rotate_bytes=record.rotate_bytes,
+            rotate_s=record.rotate_s, rotate_bytes=min(record.rotate_bytes, self._largest_bytes()),
             metadata=self._metadata, attachments=self._attachments,
         )  # fmt: skip
         self._problem = ""
         for key, payload in self._latched.items():
             self._session.write(key, payload, now_ns, latched=True)
         _log.info("recording into %s", self._session.path)
+
+    def _largest_bytes(self) -> int:
+        """Size of a file after which the limit of this process demands the next one; says so once."""
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+        if limit == resource.RLIM_INFINITY:
+            return self._config.record.rotate_bytes
+        largest = int(_OF_LIMIT * limit)
+        if largest < self._config.record.rotate_bytes and "limit" not in self._reported:
+            self._reported.add("limit")
+            text = "files may have %.0f MB (ulimit -f): a new one begins after %.0f MB"
+            _log.warning(text, limit / 1e6, largest / 1e6)
+        return largest
 
     def _start_recovery(self) -> None:
         """Recover what a crash left, in a thread: a part of 1 GB takes longer than data may wait."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
 import threading
 import time
 from collections.abc import Iterable
@@ -12,8 +13,16 @@ from pathlib import Path
 
 from vical_drivers.closing import Closing
 
+from vical_daemon.config.model import Config
+
 _log = logging.getLogger(__name__)
 _POLL_S = 0.1
+
+
+def job_name(config: Config, role: str, device: str) -> str:
+    """Name what a role does for a device on a rig's bus, e.g. ``rover.estimate.cam0``; fit for a file."""
+    bus = "" if config.bus.socket is None else re.sub(r"\W+", ".", config.bus.socket)  # may share a folder
+    return f"{config.rig}.{role}.{device}{bus}"
 
 
 class ClaimedError(Exception):

@@ -13,7 +13,7 @@ from vical_mocks.points import SimulatedRun, simulate
 
 from vical_daemon.calibrate import checkpoint
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
-from vical_daemon.calibrate.checkpoint import FILE_NAME, OLDEST_S, Checkpoint
+from vical_daemon.calibrate.checkpoint import OLDEST_S, Checkpoint, file_name
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
@@ -23,6 +23,9 @@ from vical_daemon.service.wall_clock import private_clock
 DEVICES = {"imu/imu0": "I1", "camera/cam0": "C1"}
 CLOCK = private_clock()
 TEXT = "imus: {imu0: {port: /dev/x}}\ncameras: {cam0: {uri: 'v4l2:/dev/video0'}}\ntarget: t.yaml\n"
+
+
+FILE_NAME = file_name(loads(TEXT))
 
 
 @pytest.fixture
@@ -67,6 +70,22 @@ def converged(run: SimulatedRun) -> Calibrator:
     _feed(c, run, 0.0, 12.0)
     assert c.estimate().status is Status.CONVERGED
     return c
+
+
+@pytest.mark.parametrize(
+    "other", ["rig: rover\n", "bus: {socket: /run/b.sock}\n", "calibration: {cameras: [b]}\n"]
+)
+def test_rigs_that_share_a_folder_keep_their_own(
+    tmp_path: Path, config: Config, converged: Calibrator, other: str
+) -> None:
+    """The second rig to start removed what the first had saved, and overwrote it from then on."""
+    cameras = TEXT.replace("}}\ntarget", "}, b: {uri: 'v4l2:/dev/video1'}}\ntarget")
+    Checkpoint(tmp_path, config, CLOCK).save(converged, DEVICES)
+    second = Checkpoint(tmp_path, loads((cameras if "cameras" in other else TEXT) + other), CLOCK)
+    assert second.load(DEVICES) is None
+    second.save(converged, DEVICES)
+    assert Checkpoint(tmp_path, config, CLOCK).load(DEVICES) is not None
+    assert len(list(tmp_path.iterdir())) == 1  # each is used once
 
 
 def test_it_goes_on_where_it_was(

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from vical_daemon.bus.messages import encode_string
 from vical_daemon.cli import main
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import LogFolder, LogReader, LogWriter
@@ -40,6 +41,15 @@ def test_info_of_a_log(log, capsys):
     text = capsys.readouterr().out
     assert "/vical/rig0/imu/imu0" in text
     assert "200.00" in text
+
+
+def test_messages_without_a_stamp_have_no_latency(tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as writer:
+        writer.write("vical/rig0/command/record", encode_string("split"), 10**18)
+    main(["info", str(path), "--json"])
+    (command,) = json.loads(capsys.readouterr().out)["topics"]
+    assert (command["count"], command["latency_ms"]) == (1, None)  # was 0 ms, whatever the delay
 
 
 def test_info_of_a_folder_and_of_a_cut_log(asl_folder, log, capsys):

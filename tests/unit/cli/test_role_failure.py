@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -28,3 +29,22 @@ def test_only_a_bug_is_traced(
     assert len([record for record in caplog.records if record.exc_info]) == traced
     with pytest.raises(type(error)):
         threads.raise_failure()
+
+
+def test_modules_of_roles_are_loaded_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`vical run detect estimate record` ended in a deadlock of two imports, now and then."""
+    loading, together = [], []
+
+    def load(name: str) -> SimpleNamespace:
+        loading.append(name)
+        time.sleep(0.05)
+        together.append(len(loading))
+        loading.remove(name)
+        return SimpleNamespace(run=lambda *_arguments: None)
+
+    monkeypatch.setattr(process_sets, "import_module", load)
+    threads = process_sets.RoleThreads(Config(rig="r"), LocalBus())
+    for role in ("record", "detect", "estimate"):
+        threads.start(role)
+    assert threads.stop_all()
+    assert together == [1, 1, 1]

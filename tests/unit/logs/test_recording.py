@@ -19,6 +19,7 @@ from vical_daemon.logs.checks import gyro_scale
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.model import ImuArrays, Stamped, in_stamp_order
 from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
+from vical_daemon.logs.summary import summarise_recording
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 G = 9.80665
@@ -213,6 +214,10 @@ def test_bags_of_ros_are_read(tmp_path, kind, a_motion):
     assert samples.specific_force_mps2.tobytes() == force.tobytes()
     images = [payload for key, payload in recording.messages() if key == "vical/rig0/camera/left/image"]
     assert m.decode_image(images[3]).pixels().tolist() == np.full((6, 8), 60).tolist()
+    topics = {topic.topic: topic for topic in summarise_recording(recording).topics}
+    assert topics["/imu/data"].latency_ms == pytest.approx((1e-3, 1e-3))
+    assert topics["/left/image_raw"].latency_ms == pytest.approx((9e-3, 9e-3))
+    assert topics["/left/image_raw"].count == len(images) and set(topics) == {"/imu/data", "/left/image_raw"}
 
 
 def test_topics_can_be_chosen(tmp_path, a_motion):

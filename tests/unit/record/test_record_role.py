@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import threading
 import time
@@ -130,6 +131,26 @@ def test_rotation_loses_nothing(make, tmp_path):
         assert about["segment"] == str(i)
         runs.add(about["run"])
     assert len(runs) == 1
+
+
+def test_a_limit_of_file_sizes_begins_new_files_and_loses_nothing(make, tmp_path, caplog):
+    """Each file failed with "File too large", and 5 s were lost before the next one."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, before[1]))
+    try:
+        recorder = make()
+        recorder.tick()
+        for i in range(0, 20_000, 500):
+            feed(recorder, 500, i)
+            recorder.tick()
+        recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    segments = LogFolder(tmp_path / "log").segments()
+    assert len(segments) >= 2
+    assert [n for path in segments for n in numbers(path)] == list(range(20_000))
+    (line,) = (r.getMessage() for r in caplog.records if r.levelname != "INFO")
+    assert line == "files may have 1 MB (ulimit -f): a new one begins after 1 MB"
 
 
 def test_segments_repeat_what_each_needs(make, tmp_path):

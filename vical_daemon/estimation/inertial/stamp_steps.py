@@ -46,7 +46,7 @@ class StampSteps:
     _alike: int = 0  # latest intervals that are like the one before, and not like the usual one
     _before_s: float = 0.0  # the total before a step that is not certain yet
     _since: int = 0
-    _untold_s: float = 0.0  # steps that are certain, and were not announced
+    _untold_s: float = 0.0  # steps that have become certain since the last call of `news`
 
     def even(self, t_s: float) -> float:
         """Put the stamp of the next reading, s, on the even axis."""
@@ -103,15 +103,16 @@ class StampSteps:
         self._untold_s += step_s
 
     def news(self, stated_s: float = 0.0) -> list[Event]:
-        """Steps that have become certain, together, once they exceed what the driver states of its stamps.
+        """Steps that have become certain since the last call, together, if larger than the driver states.
 
-        Within that a mapping moves all the time, as arrivals jitter.
+        Within what it states a mapping moves all the time, as arrivals jitter. Such steps are not added up:
+        between them the mapping slides back, as its slope is corrected, so that their sum grows while the
+        stamps stay where they are.
 
         Args:
             stated_s: One sigma of the mapping as the driver states it, s; 0: it states nothing.
         """
-        step_s = self._untold_s
+        step_s, self._untold_s = self._untold_s, 0.0
         if not step_s or abs(step_s) < SURE_SIGMAS * stated_s:
             return []
-        self._untold_s = 0.0
         return [Event(EventKind.IMU_CLOCK_REMAPPED, value=step_s)]
