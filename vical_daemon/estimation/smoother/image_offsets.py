@@ -92,7 +92,7 @@ class ImageOffsets:
         Returns:
             Both of shape (m,), m at most F n: images of which links or pixels know nothing say nothing.
         """
-        b_info = by_pixels[:, self.ways[:, None], self.ways]
+        of_pixels = by_pixels[:, self.ways[:, None], self.ways]
         by_links = self._information
         if allowed is not None:
             taken = solve_triangular(allowed._root, allowed._with(self), lower=True)
@@ -102,8 +102,8 @@ class ImageOffsets:
             k = np.arange(len(allowed.ways))
             of_allowed[:, k, k] += allowed._prior * (1.0 - held)
             both = by_pixels[:, allowed.ways[:, None], self.ways]
-            b_info = b_info - np.swapaxes(both, 1, 2) @ np.linalg.solve(of_allowed, both)
-        pixels = np.diagonal(b_info, axis1=1, axis2=2).ravel()
+            of_pixels = of_pixels - np.swapaxes(both, 1, 2) @ np.linalg.solve(of_allowed, both)
+        pixels = np.diagonal(of_pixels, axis1=1, axis2=2).ravel()
         least = 1e-6 * by_pixels[:, self.ways, self.ways].ravel()
         known = (by_links > 1e-6 * self._information) & (pixels > least)  # more than rounding
         usual = 1.0 / by_links[known] + 1.0 / pixels[known]

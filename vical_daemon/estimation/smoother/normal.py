@@ -316,6 +316,8 @@ class Problem:
             alone = np.zeros(3)
             alone[way] = 1.0
             shown = ImageOffsets(self.window, e, J, alone).shown(by_pixels, allowed)
+            if not len(shown[0]):
+                continue  # at rest nothing shows delays
             sigma, sure = excess(*shown), evidence(*shown)
             if sigma > FLOORS[way][0] and sure > surest:
                 found, surest = self.noise._replace(**{name: sigma}), sure

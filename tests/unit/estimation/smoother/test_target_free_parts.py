@@ -20,6 +20,7 @@ from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother import image_offsets
 from vical_daemon.estimation.smoother.bundle import Bundle, correlation
 from vical_daemon.estimation.smoother.handover import initial_prior
 from vical_daemon.estimation.smoother.image_offsets import ImageOffsets
@@ -330,6 +331,14 @@ def test_a_window_tells_late_images_from_shifted_ones(scene, off):
     error = camera_difference(fit.carry.camera, scene.camera, layout.camera, layout.size)[CORE:]
     P = fit.carry.covariance()[CORE:, CORE:]
     assert error @ np.linalg.solve(P, error) < 26.1  # chi-square, 8 degrees of freedom, 99.9 %
+
+
+def test_at_rest_no_image_can_be_seen_to_be_late(scene, monkeypatch):
+    moves = image_offsets._moves
+    monkeypatch.setattr(image_offsets, "_moves", lambda window: moves(window) * [0.0, 1.0, 1.0])
+    window = scene.window()
+    problem = bundle_of(window, POSE_AND_CLOCK, 1.0).problem
+    assert problem.suspected(problem.view(window.observe())).jitter_s == 0.0
 
 
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
