@@ -231,10 +231,10 @@ FREE: dict[str, Mechanism] = {
         lambda: [(bundle, "correlation", gives(1.0))],
         free=True,
     ),
-    "free: stamp jitter": Mechanism(
+    "free: late and shifted images": Mechanism(
         SMALL,
-        "late and early images as unknowns",
-        lambda: [(Bundle, "_suspects_jitter", gives(False))],
+        "by how much each image is late or shifted, as unknowns",
+        lambda: [(Bundle, "_suspects_offsets", gives(False))],
         free=True,
         faults=("free: stamp jitter 1 ms",),
     ),
