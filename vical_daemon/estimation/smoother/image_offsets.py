@@ -21,7 +21,7 @@ from vical_daemon.estimation.smoother.window import IntArray, Window
 
 LATE, SHIFTED = slice(0, 1), slice(1, 3)
 """The ways in which an image may be off: late (s); to the side and down (px)."""
-FLOORS = np.array([2e-5, 2e-2, 2e-2])  # of a jitter, s, and of shifts, px, that are ones
+FLOORS = np.array([2e-5, 2e-2, 2e-2])  # s, px, px: less is none; with a board the grid of shifts begins there
 
 
 class ImageOffsets:
