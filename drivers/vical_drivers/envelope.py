@@ -10,6 +10,7 @@ alpha-beta) carry the mean delay as a bias; the envelope does not. What no one-w
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 from itertools import islice
@@ -156,9 +157,10 @@ class LowerEnvelope:
         points = list(self._blocks)
         if self._best is not None:
             points.append(self._best)
-        hull = _lower_hull(points)
-        memory_s = min(self.window_s, points[-1][0] - points[0][0])
-        slope = _slope_at(hull, self._newest_s - memory_s / 2.0, memory_s / 4.0)
+        hull = _possible(_lower_hull(points), self.options.max_skew)
+        memory_s = min(self.window_s, hull[-1][0] - hull[0][0])
+        slope = _slope_at(hull, hull[-1][0] - memory_s / 2.0, memory_s / 4.0)
+        points = points[bisect_left(points, hull[0]) :]  # those before are late: they say nothing of jitter
         spread_s = self._spread_s(points)
         # A short memory of jittery points says little about the skew: weigh it against the prior.
         skew_sigma = 2.0 * spread_s / memory_s if memory_s > 0 else math.inf
@@ -168,7 +170,7 @@ class LowerEnvelope:
         self.skew = min(max(slope * weight, -bound), bound)
         self.offset_s = min(d - self.skew * x for x, d in hull)
         self._skew_sigma = prior * math.sqrt(1.0 - weight)
-        self.sigma_s = self._uncertainty_s(points, spread_s)
+        self.sigma_s = self._uncertainty_s(points, spread_s, points[-1][0] - hull[-1][0])
 
     def _spread_s(self, points: list[tuple[float, float]]) -> float:
         """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
@@ -177,9 +179,9 @@ class LowerEnvelope:
         believable_s = self._typical_delay_s / math.sqrt(max(1, self._points))
         return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
 
-    def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
-        memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
-        lead_s = memory_s / 3.0
+    def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float, since_s: float) -> float:
+        memory_s = max(points[-1][0] - points[0][0] - since_s, self.options.block_s)
+        lead_s = memory_s / 3.0 + since_s
         if len(points) < 5:
             spread_s = max(spread_s, self._typical_delay_s)
         wander_s = 0.5 * self.options.skew_wander_per_s * lead_s**2
@@ -201,6 +203,20 @@ def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
             continue
         hull.append((x, d))
     return hull
+
+
+def _possible(hull: list[tuple[float, float]], max_skew: float) -> list[tuple[float, float]]:
+    """Leave out the ends of a hull that no two clocks can have: those points are late.
+
+    At the start all arrivals may be late by much, as on a computer that is just loading programs. The slope
+    down to the first arrival in time is then no skew of the clocks.
+    """
+    first, last = 0, len(hull) - 1
+    while first < last and _slope(hull[first], hull[first + 1]) < -max_skew:
+        first += 1
+    while first < last and _slope(hull[last - 1], hull[last]) > max_skew:
+        last -= 1
+    return hull[first : last + 1]
 
 
 def _slope_at(hull: list[tuple[float, float]], x_s: float, span_s: float) -> float:

@@ -82,6 +82,23 @@ def test_sigmas_stay_honest_where_jitter_begins_and_ends(delay_s):
     assert np.abs(error_s / sigma_s)[true_s > 105.0].max() < 1.0
 
 
+@pytest.mark.parametrize("lag_s", [0.02, 0.05, 0.12])
+def test_arrivals_that_are_all_late_at_the_start_say_nothing_of_the_skew(lag_s):
+    """The slope down to the first one in time was taken for skew: 3 ms off for seconds, stated 0.2 ms."""
+
+    def late_at_first(rng, n):
+        return np.where(np.arange(n) < 130, lag_s, 0.0) + rng.exponential(2e-4, n)
+
+    for seed in range(3):
+        ticks, true_s, arrival_ns = arrivals(800, 100.0, 25.0, late_at_first, seed=seed)
+        clock = DeviceClock(TICK_HZ, rate_hz=100.0)
+        stamps = run(clock, ticks, arrival_ns)
+        error_s = np.array([s.t_device_event_ns for s in stamps]) * 1e-9 - true_s
+        sigma_s = np.array([s.t_sigma_ns for s in stamps]) * 1e-9
+        assert np.abs(error_s[180:]).max() < 2e-4
+        assert np.abs(error_s[180:] / sigma_s[180:]).max() < 4.0
+
+
 def test_stamps_always_increase():
     ticks, _, arrival_ns = arrivals(2000, 1000.0, 300.0, lambda r, n: r.exponential(3e-3, n))
     stamps = [s.t_device_event_ns for s in run(DeviceClock(TICK_HZ, rate_hz=1000.0), ticks, arrival_ns)]
