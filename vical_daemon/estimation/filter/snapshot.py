@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -24,7 +26,8 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     where, held = f.layout.cameras[name], f.layout.held.get(name)
     onto = _onto(f, name)
     camera = reported_camera(f.state.cameras[name], onto)
-    lens = np.concatenate([camera.intrinsics, camera.distortion]) if held is None else held.values
+    lens = np.concatenate([camera.intrinsics, camera.distortion])
+    lens = lens if held is None else held.values[: len(lens)]
     spread = float(np.sqrt(f.consistency[name].factor))
     lens_sigma = _lens_sigmas(f, name, spread, onto, camera)
     return camera_snapshot(
@@ -41,9 +44,12 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
 
 
 def _onto(f: CalibrationFilter, name: str) -> FloatArray:
-    """See `onto_model`."""
-    agreement = f.agreement.get(name)
-    return onto_model(f.state.cameras[name], np.zeros((1, 1)) if agreement is None else agreement.seen)
+    """See `onto_model`; a lens that is held is reported as it is given."""
+    agreement, camera = f.agreement.get(name), f.state.cameras[name]
+    if name in f.layout.held:
+        n = 4 + len(camera.distortion)
+        return np.eye(n - camera.term, n)
+    return onto_model(camera, np.zeros((1, 1)) if agreement is None else agreement.seen)
 
 
 def _calibration_covariance(
@@ -80,12 +86,12 @@ def _lens_sigmas(
     return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + limit**2))
 
 
-def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
-    """Biases; where asked for, the matrices; positions of the accelerometer's axes if known to be apart."""
+def imu_estimate(f: CalibrationFilter, asked: Collection[str], axes_m: FloatArray | None) -> ImuEstimate:
+    """Biases; where asked for, the matrices; positions of the accelerometer's axes, where they are given."""
     sigma, state = f.sigmas(), f.state
     return imu_snapshot(
         np.concatenate([state.gyro_bias, state.accel_bias]),
         np.concatenate([sigma[GYRO_BIAS], sigma[ACCEL_BIAS]]),
-        (state.gyro_matrix, state.accel_matrix) if matrices else (),
-        state.accel_positions if "size_effect" in f.off else None,
+        (state.gyro_matrix, state.accel_matrix) if "imu_intrinsics" in asked else (),
+        axes_m,
     )

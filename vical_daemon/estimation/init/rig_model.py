@@ -11,7 +11,9 @@ from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import Layout, State, make_layout
 from vical_daemon.estimation.selection import model_selection
 
-_ALWAYS = frozenset({model_selection.IMU, model_selection.LAG, model_selection.SIZE})
+_ALWAYS = frozenset(
+    {model_selection.IMU, model_selection.LAG, model_selection.SIZE, model_selection.SIZE_EFFECT}
+)
 """Always states, whether asked for or not: see `model_selection`."""
 
 
@@ -36,18 +38,15 @@ class RigModel:
     def __init__(
         self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray
     ) -> None:
-        self.priors, self.target = dict(cameras), target_points_m
+        self.priors = {name: prior.with_next_term() for name, prior in cameras.items()}
+        self.target = target_points_m
         self.size = self.ratio = 1.0
         self.silent: frozenset[str] = frozenset()
-        if "intrinsics" not in options.fix:
-            self.priors = {name: prior.with_next_term() for name, prior in cameras.items()}
         self._stated = target_points_m
         self._options = options
         self.turns = HalfTurns(target_points_m, alike=options.target_alike)
         self._held = self._held_lenses()
         self._states = options.estimate | _ALWAYS
-        if "intrinsics" not in options.fix:  # else what is reported for a wrong lens would be far off
-            self._states |= {model_selection.SIZE_EFFECT}
         if "intrinsics" not in options.fix or self._held:  # else a wrong lens would look like a bent target
             self._states |= {model_selection.TARGET}
         self.layout = self._lay_out()

@@ -5,8 +5,8 @@ are exact puts the result up to ten stated sigmas off where they are not. So the
 combination of them that may be zero is an alternative model. Its Gaussian is that of the estimator,
 conditioned on these zeros. Its odds follow from how far the states lie from zero (Savage-Dickey density
 ratio). The reported mean and covariance are those of the mixture. With a fixed lens the reported mean is that
-of the calibration for the lens as given; the covariance includes how far the mixture lies from it.
-[docs/math/filter.md, eq. (18) and (19)]
+of the calibration for the lens as given and, if it is not this camera's lens, for all else as specified. The
+covariance includes how far the mixture lies from it. [docs/math/filter.md, eq. (18) and (19)]
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ class Block:
         sigma: Of their prior, shape (n,).
         stated: How well they are known where what they describe is as specified, shape (n,); zeros: exactly.
         held: They are reported as zero in any case.
+        lens: They are a fixed lens. Where it is not as specified, all else is reported as specified.
         off: Probability that they are not zero, before any data.
     """
 
@@ -48,6 +49,7 @@ class Block:
     sigma: FloatArray
     stated: FloatArray
     held: bool = False
+    lens: bool = False
     off: float = OFF
 
     @classmethod
@@ -58,7 +60,7 @@ class Block:
     @classmethod
     def of_lens(cls, where: slice, lens: FixedLens, now: FloatArray) -> Block:
         """Make that of a fixed lens; `now`: fx fy cx cy and the distortion as estimated, shape (n,)."""
-        return cls(where, now - lens.values, lens.off_sigma, lens.sigma, held=True, off=lens.off)
+        return cls(where, now - lens.values, lens.off_sigma, lens.sigma, held=True, lens=True, off=lens.off)
 
     @property
     def share(self) -> FloatArray:
@@ -116,18 +118,24 @@ def not_zero(shares: Weights, name: str) -> float:
 
 
 def mixture(
-    S: FloatArray, every: Mapping[str, Block], weights: Weights, factor: float
+    S: FloatArray,
+    every: Mapping[str, Block],
+    weights: Weights,
+    factor: float,
+    asked: Collection[str] = (),
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance over all models.
 
-    Where a lens is held what is reported is the mean of the hypotheses with this lens exactly as given; the
-    covariance is about that, of all that may be.
+    Where a lens is held what is reported is the mean of the hypotheses with this lens exactly as given. A
+    wrong lens bends what the data say of imu and target, so where it is wrong all else is as specified, as
+    it is for calibrators without these states. The covariance is about that, of all that may be.
 
     Args:
         S: Square root of the covariance, shape (n, m).
         every: All blocks.
         weights: Probability of each hypothesis.
         factor: Reported covariance over that of `S`.
+        asked: Blocks that are to be estimated in any case.
 
     Returns:
         What is reported moves by, shape (n,), and the square root of the covariance over `factor`, shape
@@ -149,8 +157,7 @@ def mixture(
     found, end, as_given = _Conditioned.none(len(likely), rows.shape[1]), 0, None
     for name, block in order.items():
         if block.held and as_given is None:
-            exactly = np.where(np.arange(rows.shape[1]) < k, rows[end:], 0.0)
-            as_given = found.on(exactly, values[end:], [True] * len(likely)).of_each(k)[1]
+            as_given = _as_given(found, order, rows, likely, asked)
         at = slice(end, end + len(block.values))
         found, end = found.on(rows[at], values[at], [name in true for true in likely]), at.stop
     P, means = found.of_each(k)
@@ -169,6 +176,37 @@ def mixture(
     for name in held:
         shown[every[name].where] = -every[name].values
     return shown, joined(mixed, by @ mean - shown, factor)
+
+
+def _as_given(
+    found: _Conditioned,
+    order: Mapping[str, Block],
+    rows: FloatArray,
+    likely: Collection[tuple[str, ...]],
+    asked: Collection[str],
+) -> FloatArray:
+    """Mean of each hypothesis that is reported for held blocks, shape (h, k).
+
+    Args:
+        found: Conditioned on the other blocks.
+        order: All blocks, held ones last.
+        rows: Of them, shape (k, w).
+        likely: The hypotheses.
+        asked: See `mixture`.
+    """
+    values = np.concatenate([block.values for block in order.values()])
+    exactly = np.where(np.arange(rows.shape[1]) < len(values), rows, 0.0)
+    at = sum(len(block.values) for block in order.values() if not block.held)
+    means = found.on(exactly[at:], values[at:], [True] * len(likely)).of_each(len(values))[1].copy()
+    lenses = {name for name, block in order.items() if block.lens}
+    wrong = [not lenses <= set(true) for true in likely]
+    if any(wrong):
+        zero = np.concatenate(
+            [np.full(len(block.values), name not in asked) for name, block in order.items()]
+        )
+        only = _Conditioned.none(1, rows.shape[1]).on(exactly[zero], values[zero], [True])
+        means[wrong] = only.of_each(len(values))[1][0]
+    return means
 
 
 def joined(S: FloatArray, apart: FloatArray, factor: float) -> FloatArray:

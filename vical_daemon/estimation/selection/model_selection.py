@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -70,7 +70,7 @@ def blocks(f: CalibrationFilter) -> dict[str, Block]:
     layout, state = f.layout, f.state
     found = imu_and_lenses(layout, numbers_of(state), state.cameras)
     for name, camera in state.cameras.items():
-        if camera.term:
+        if camera.term and layout.lens_free(name):
             found[term_block(name)] = lens_term(layout, name, camera)
     if layout.target_scale is not None:
         where = slice(layout.target_scale, layout.target_scale + 1)
@@ -119,9 +119,17 @@ def in_doubt(f: CalibrationFilter, shares: Weights | None = None, *, believed: b
     return next((n for n in IN_DOUBT if n in doubtful and not_zero(shares, n) > enough), "")
 
 
-def averaged(f: CalibrationFilter, shares: Weights | None = None) -> CalibrationFilter:
-    """Return the filter to be reported: mean and covariance over all models; `shares`: see `in_doubt`."""
-    step, S = mixture(f.S, blocks(f), weights(f) if shares is None else shares, factor(f))
+def averaged(
+    f: CalibrationFilter, shares: Weights | None = None, asked: Collection[str] = ()
+) -> CalibrationFilter:
+    """Return the filter to be reported: mean and covariance over all models.
+
+    Args:
+        f: The filter.
+        shares: See `in_doubt`.
+        asked: See `mixture`.
+    """
+    step, S = mixture(f.S, blocks(f), weights(f) if shares is None else shares, factor(f), asked)
     if S is f.S and not step.any():
         return f
     return replace(f, state=retract(f.state, f.layout, step), S=S)

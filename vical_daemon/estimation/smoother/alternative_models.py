@@ -55,7 +55,7 @@ class AlternativeModels:
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
         lens: The lens, where it is fixed; None: it is estimated, or taken as exact.
-        imu_asked: The imu's matrices are asked for.
+        asked: Blocks that are to be estimated in any case.
         imu_sigma: Prior of the entries of the imu's matrices.
         rolling: The shutter is known to be a rolling one.
         stamp_sigma_s: How well the imu's driver knows its device's clock, s.
@@ -71,8 +71,8 @@ class AlternativeModels:
         (self._camera,) = layout.cameras
         self.lens = layout.held.get(self._camera)
         self._off = asked & {model_selection.IMU, model_selection.LAG, model_selection.SIZE_EFFECT}
-        self.imu_asked = model_selection.IMU in asked
-        self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
+        self.asked = asked
+        self.imu_sigma = KNOWN_OFF_SIGMA if model_selection.IMU in asked else ENTRY_SIGMA
         self.drifting = False
         self.rolling = self._rolling_known = rolling
         self.stamp_sigma_s = 0.0
@@ -225,7 +225,7 @@ class AlternativeModels:
             tuple(self.clocks(carry, factor)),
             every,
             weights,
-            gyro_frame=not self.imu_asked,
+            asked=self.asked,
             rolling=self.rolling,
         )
 

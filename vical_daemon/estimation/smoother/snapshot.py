@@ -19,6 +19,7 @@ from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, mixture
+from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.smoother.clock_changes import Clock, over_clocks
 from vical_daemon.estimation.smoother.marginal_prior import BIASES, MarginalPrior, later
 
@@ -33,7 +34,7 @@ class ReportedModels:
         clocks: Hypotheses about the clocks; none: the drift is not estimated.
         every: What may be as specified: the imu, a fixed lens.
         weights: Probability of each hypothesis about these.
-        gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
+        asked: Blocks that are to be estimated in any case.
         rolling: The shutter is known to be a rolling one: its readout is reported.
     """
 
@@ -42,7 +43,7 @@ class ReportedModels:
     clocks: tuple[Clock, ...]
     every: Mapping[str, Block]
     weights: Weights
-    gyro_frame: bool = False
+    asked: frozenset[str] = frozenset()
     rolling: bool = True
 
     @cached_property
@@ -52,10 +53,10 @@ class ReportedModels:
         (name,) = layout.cameras
         d, S = self._over_clocks()
         every = {block: replace(b, values=b.values + d[b.where]) for block, b in self.every.items()}
-        step, S = mixture(S, every, self.weights, self.factor)
+        step, S = mixture(S, every, self.weights, self.factor, self.asked)
         d = d + step
         camera = moved_camera(self.carry.camera, layout.camera, d)
-        if self.gyro_frame:
+        if IMU not in self.asked:
             gyro_matrix = matrices_of(self.carry.imu + d[layout.inertial])[0]
             cameras, S = in_gyro_frame(layout, gyro_matrix, {name: camera}, S)
             camera = cameras[name]

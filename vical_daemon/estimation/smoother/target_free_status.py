@@ -15,6 +15,7 @@ from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
+from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
@@ -280,7 +281,7 @@ class TargetFreeStatus(Evaluator):
             self.believed &= not doubt
             reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
             cameras, missing = {self.camera: camera}, {self.camera: weak}
-            imu = imu_estimate(carry, matrices=self.models.imu_asked, positions=self.models.axes_apart)
+            imu = imu_estimate(carry, matrices=IMU in self.models.asked, positions=self.models.axes_apart)
         refused, seen = (sum(x) for x in zip((0, 0), *self._refused, strict=True))
         return self._put_together(
             reported,

@@ -12,7 +12,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.guidance import WeakDirection, of_camera
-from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import OFF, SURE
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
@@ -48,7 +48,7 @@ class StatusEvaluator(Evaluator):
 
     def __init__(self, options: CalibrationOptions) -> None:
         super().__init__(options, "the target has not been seen yet: show the whole board to the camera", 300)
-        self._imu_asked = "imu_intrinsics" in options.estimate
+        self._asked = options.estimate
         self.frames = 0
         self.in_doubt = ""
         self.clocks_doubtful = False  # a time shift may be drifting
@@ -156,6 +156,7 @@ class StatusEvaluator(Evaluator):
         shares = None if f is None else model_selection.weights(f)
         self.in_doubt = "" if f is None else self._doubt(f, shares)
         self.believed &= not self.in_doubt
+        axes_m = _axes_m(f or stale)
         f = None if f is None else self.weighed(f, shares)
         stale = None if stale is None else self.weighed(stale)
         shown = f or stale
@@ -180,7 +181,7 @@ class StatusEvaluator(Evaluator):
             missing,
             partial=f is not None and f.unobservable is not None,
             frames=self.frames,
-            imu=None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
+            imu=None if shown is None else imu_estimate(shown, self._asked, axes_m),
             gravity=[] if shown is None else shown.state.gravity.tolist(),
             refused=self._points[0] / max(self._points[1], 1),
         )
@@ -232,8 +233,8 @@ class StatusEvaluator(Evaluator):
             f: The filter.
             shares: `model_selection.weights` of it, if they are known.
         """
-        f = model_selection.averaged(f, shares).allowing_for_arm_bias()
-        if not self._imu_asked:
+        f = model_selection.averaged(f, shares, self._asked).allowing_for_arm_bias()
+        if model_selection.IMU not in self._asked:
             cameras, S = in_gyro_frame(f.layout, f.state.gyro_matrix, f.state.cameras, f.S)
             f = replace(f, state=replace(f.state, cameras=cameras), S=S)
         return clock_drift.averaged(f)
@@ -293,6 +294,11 @@ class StatusEvaluator(Evaluator):
         if len(self._squares) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
+
+
+def _axes_m(f: CalibrationFilter | None) -> FloatArray | None:
+    """Positions of the accelerometer's axes, if they are known to be apart or asked for; m, shape (3, 3)."""
+    return f.state.accel_positions if f is not None and model_selection.SIZE_EFFECT in f.off else None
 
 
 def _lens_may_have_jumped(f: CalibrationFilter, shares: model_mixture.Weights | None) -> bool:

@@ -10,6 +10,7 @@ from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
@@ -78,7 +79,9 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     x[NUMBERS] = known.imu
     models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=True)
     models.drifting = True
-    reported = camera_estimate(replace(models.weighed(known, 1.0, compared=True), gyro_frame=False), 0.5, 0.5)
+    reported = camera_estimate(
+        replace(models.weighed(known, 1.0, compared=True), asked=frozenset({IMU})), 0.5, 0.5
+    )
     mean, covariance = mixture(P, x)
     assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(
         mean[POSE][:3], abs=1e-9
