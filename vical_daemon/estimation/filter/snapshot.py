@@ -44,12 +44,9 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
 
 
 def _onto(f: CalibrationFilter, name: str) -> FloatArray:
-    """See `onto_model`; a lens that is held is reported as it is given."""
-    agreement, camera = f.agreement.get(name), f.state.cameras[name]
-    if name in f.layout.held:
-        n = 4 + len(camera.distortion)
-        return np.eye(n - camera.term, n)
-    return onto_model(camera, np.zeros((1, 1)) if agreement is None else agreement.seen)
+    """See `onto_model`."""
+    agreement = f.agreement.get(name)
+    return onto_model(f.state.cameras[name], np.zeros((1, 1)) if agreement is None else agreement.seen)
 
 
 def _calibration_covariance(
