@@ -70,7 +70,7 @@ def _within(items: Items, t_ns: int, at_s: float, seconds: float) -> bool:
 
 def _at(item: Any, t_ns: int) -> Any:
     """An item under another stamp."""
-    return replace(item, **{"t_cam_ns" if isinstance(item, PointsFrame) else "stamp_ns": t_ns})
+    return replace(item, t_cam_ns=t_ns) if isinstance(item, PointsFrame) else item._replace(stamp_ns=t_ns)
 
 
 CASES: dict[str, tuple[float, Change]] = {

@@ -30,7 +30,7 @@ STATED = (0.4, 0.4, 0.3, 0.3)
 class Linear:
     """Measurements of all errors of a filter whose lens lies `off` times its prior's sigma off."""
 
-    def __init__(self, off: float, given: bool = False):
+    def __init__(self, off: float, given: bool = False, estimate: frozenset = frozenset()):
         rng = np.random.default_rng(3)
         self.lens = FixedLens.of(
             CameraPrior(
@@ -39,7 +39,7 @@ class Linear:
             )
         )  # fmt: skip
         self.layout = make_layout(
-            {NAME: "radtan"}, fix=frozenset({"intrinsics"}), estimate=frozenset(), held={NAME: self.lens}
+            {NAME: "radtan"}, fix=frozenset({"intrinsics"}), estimate=estimate, held={NAME: self.lens}
         )
         n = self.layout.size
         self.where = self.layout.lens(NAME)
@@ -52,9 +52,11 @@ class Linear:
         self.noise = 0.7
         self.z = self.H @ truth + self.noise * rng.normal(size=2 * n)
 
-    def posterior(self, lens_sigma: np.ndarray):
+    def posterior(self, lens_sigma: np.ndarray, zero: int | None = None):
         sigma = self.prior.copy()
         sigma[self.where] = np.maximum(lens_sigma, 1e-9)
+        if zero is not None:
+            sigma[zero] = 1e-9
         P = np.linalg.inv(np.diag(sigma**-2.0) + self.H.T @ self.H / self.noise**2)
         return P @ self.H.T @ self.z / self.noise**2, P
 
@@ -110,6 +112,23 @@ def test_a_wrong_lens_keeps_the_answer_of_the_stated_one_and_widens_it_by_what_t
     assert camera.intrinsics == problem.lens.values[:4].tolist()
     lens_sigma = np.sqrt(np.diag(expected)[problem.where])
     np.testing.assert_allclose([*camera.intrinsics_sigma, *camera.distortion_sigma], lens_sigma, rtol=1e-3)
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_with_a_wrong_lens_all_that_was_not_asked_for_is_reported_as_specified(asked):
+    """Else the errors of the lens look like errors of imu and target, which other calibrators do not know."""
+    problem = Linear(off=1.0, estimate=frozenset({"target_scale"}))
+    f = problem.filter()
+    f.off |= {"target_scale"}  # known to be off, or asked for
+    shown = model_selection.averaged(f, asked={"target_scale"} if asked else set())
+    size = problem.layout.target_scale
+    x, _ = problem.posterior(np.zeros(8), None if asked else size)
+    free, P = problem.posterior(problem.lens.off_sigma)
+    np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-6)
+    assert shown.state.target_scale - 1.0 == pytest.approx(x[size] if asked else 0.0, abs=1e-7)
+    rows = problem.layout.cameras[NAME].position
+    expected = P + np.outer(x - free, x - free)
+    np.testing.assert_allclose((shown.S @ shown.S.T)[rows, rows], expected[rows, rows], rtol=1e-3)
 
 
 def test_a_stated_sigma_is_allowed_for_even_where_nothing_contradicts_the_lens():
@@ -236,6 +255,28 @@ def test_a_right_fixed_lens_is_not_doubted(run):
     assert estimate.events == []
     assert estimate.cameras[NAME].intrinsics_sigma == [0.0] * 4
     assert estimate.cameras[NAME].distortion_sigma == [0.0] * 4
+
+
+def test_a_right_fixed_lens_and_an_accelerometer_whose_axes_are_apart():
+    """Positions of the axes were states with a free lens only: 7 sigma off, `converged`."""
+    rng = np.random.default_rng(35)
+    apart_m = rng.normal(0.0, 4e-3, (3, 3))
+    rig = reference_rig(35, timeshift_cam_imu_s=0.02, accel_positions=apart_m - apart_m.mean(axis=0))
+    true = simulate(35, 20.0, rig=rig, camera_rate_hz=15.0, corner_sigma_px=0.3)
+    far, events = [], []
+
+    def each(c):
+        estimate = c.estimate()
+        events.extend(e.kind for e in estimate.events)
+        if estimate.cameras:
+            x, sigma = errors(estimate, true)
+            far.append(float(np.abs(x / sigma).max()))
+
+    c = calibrate(true, HELD, each=each)
+    assert c.estimate().status is Status.CONVERGED
+    assert events == [EventKind.ACCEL_POSITIONS]
+    assert max(far) < 5.0
+    assert far[-1] < 4.0
 
 
 def test_where_nothing_is_estimated_that_a_lens_could_harm_it_is_no_state(run):
