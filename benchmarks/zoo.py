@@ -2,6 +2,8 @@
 
 python -m benchmarks zoo --trials 40
 python -m benchmarks zoo --trials 30 --target-free
+python -m benchmarks zoo --trials 60 --all-off
+    imu, board, clocks, stamps and shutter slightly off at once
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from functools import partial
 import numpy as np
 from scipy.stats import chi2
 from vical_mocks.harness.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
-from vical_mocks.random_rigs import draw, draw_sampling
+from vical_mocks.random_rigs import draw, draw_all_off, draw_sampling
 
 from benchmarks import runner, scores
 from benchmarks.montecarlo import lying, summary
@@ -21,16 +23,20 @@ from vical_daemon.estimation.measurements import CalibrationOptions
 _UNSURE = 1e-4  # probability of an honest answer with a larger normalised error
 
 
-def trial(target_free: bool, imu_off: bool, seconds: float, seed: int) -> runner.Result:
+def trial(target_free: bool, imu_off: bool, all_off: bool, seconds: float, seed: int) -> runner.Result:
     """One rig, nothing given but its noise densities and a lens 3 % off."""
-    run, known = draw(seed, seconds, target_free=target_free, imu_off=imu_off)
+    if all_off:
+        run, known, board_m = draw_all_off(seed, seconds, target_free=target_free)
+    else:
+        run, known = draw(seed, seconds, target_free=target_free, imu_off=imu_off)
+        board_m = run.points_m
     prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=known)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if known else frozenset(),
         target_free=target_free,
         imu_noise=imu_noise(run),
     )
-    subject = CalibratorSubject(options, prior, None if target_free else run.points_m)
+    subject = CalibratorSubject(options, prior, None if target_free else board_m)
     result = summary(feed(run, subject), 7, [])
     sampling = {k: v for k, v in vars(run.options).items() if k in draw_sampling(np.random.default_rng(0))}
     rate = run.rig.trajectory.mean_rate_dps(seconds)
@@ -78,12 +84,16 @@ def main(argv: list[str]) -> int:
     runner.add_arguments(parser, trials=40, seconds=25.0)
     parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
     parser.add_argument("--imu-off", action="store_true", help="imus whose scale and alignment are not true")
+    parser.add_argument(
+        "--all-off", action="store_true", help="imu, board, clocks, stamps, shutter off at once"
+    )
     args = parser.parse_args(argv)
     name = ("free" if args.target_free else "board") + ("_imu_off" if args.imu_off else "")
+    name += "_all_off" if args.all_off else ""
     code = runner.fingerprint("vical_daemon/estimation", "benchmarks/zoo.py", "mocks/vical_mocks")
     results = runner.run_trials(
         f"zoo_{name}_{args.seconds:g}s",
-        partial(trial, args.target_free, args.imu_off, args.seconds),
+        partial(trial, args.target_free, args.imu_off, args.all_off, args.seconds),
         runner.seeds_of(args),
         args,
         code,

@@ -9,14 +9,16 @@ off.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_mocks.lens import Lens
-from vical_mocks.points import SimulatedRun, board_points, simulate
+from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
 from vical_mocks.rig import NOMINAL_R_IMU_CAM, STANDARD_GRAVITY_MPS2, ImuDensities, Rig, reference_rig
+from vical_mocks.rotations import FloatArray
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import hand_motion
 
@@ -132,3 +134,42 @@ def draw(
     features = int(rng.integers(30, 120))
     run = simulate_tracks(own, seconds, rig=rig, landmarks_m=marks, max_features=features, **sampling)
     return run, lens_given
+
+
+def draw_all_off(seed: int, seconds: float, *, target_free: bool) -> tuple[SimulatedRun, bool, FloatArray]:
+    """A recording in which nothing is quite as it should be, whether its lens is given, and the board's file.
+
+    IMU matrices as `draw_matrices`; on about half the rigs each: axes of the accelerometer 4 mm apart (one
+    sigma), a rolling shutter, clocks 40 ppm apart (one sigma), a late accelerometer, noise that changes, a
+    moving average, stamps of the imu that jitter, a hidden part of the board; a board that is bent, 0.4 % too
+    large or 2 % too small.
+    """
+    base, lens_given = draw(seed, 1.0, target_free=target_free, imu_off=True)
+    rng = np.random.default_rng([seed, 73])
+    off: dict[str, Any] = {}
+    if rng.random() < 0.5:
+        off |= {
+            "readout_s": float(rng.uniform(4e-3, 0.03)),
+            "readout_axis": str(rng.choice(["rows", "columns"])),
+        }
+    if rng.random() < 0.5:
+        off["clock_skew_ppm"] = float(rng.normal(0.0, 40.0))
+    if rng.random() < 0.5:
+        apart_m = rng.normal(0.0, 4e-3, (3, 3))
+        off["accel_positions"] = apart_m - apart_m.mean(axis=0)  # the lever arm refers to their mean
+    options = {k: v for k, v in vars(base.options).items() if k != "epoch_ns"} | {
+        "accel_lag_s": float(rng.choice([0.0, 1e-4, 3e-4])),
+        "noise_spread": float(rng.choice([0.0, 0.4])),
+        "imu_stamp_jitter_s": float(rng.choice([0.0, 0.0, 1e-4])),
+        "imu_average_s": float(rng.choice([0.0, 1.0])) / base.options.imu_rate_hz,
+        "corner_sigma_px": float(np.exp(rng.uniform(np.log(0.08), np.log(0.6)))),
+    }
+    rig, file_m = replace(base.rig, **off), base.points_m
+    if target_free:
+        features = int(rng.integers(30, 120))
+        run = simulate_tracks(seed, seconds, rig=rig, landmarks_m=file_m, max_features=features, **options)
+        return run, lens_given, file_m
+    board_m = crooked_board(seed, file_m) if rng.random() < 0.6 else file_m
+    board_m = board_m * float(rng.choice([1.0, 1.0, 1.004, 0.98]))
+    options["hidden_fraction"] = float(rng.choice([0.0, 0.3]))
+    return simulate(seed, seconds, rig=rig, points_m=board_m, **options), lens_given, file_m
