@@ -27,7 +27,6 @@ from vical_daemon.estimation.noise.shared_errors import (
     SHIFTS_PX,
     WAYS,
     SharedErrors,
-    shared_ways,
 )
 from vical_daemon.estimation.noise.variance_components import of_window
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -78,13 +77,15 @@ def window_start(
         The start, or None where the data do not hold together.
     """
     window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
-    if window is None:
+    now = None if window is None else window.present()
+    if window is None or now is None:
         return None
     try:  # as if corners were independent a shift of the image would count as motion
-        window.shared = {name: shared.sigmas for name, shared in shared_errors(window).items()}
-        if not window.solve():
+        window.shared = {name: shared.sigmas for name, shared in shared_errors(window, now).items()}
+        now = window.solve(now)
+        if now is None:
             return None
-        shared = shared_errors(window)
+        shared = shared_errors(window, now)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     trial = window.filter(make(deepcopy(state)))
@@ -113,16 +114,13 @@ def _size(f: CalibrationFilter, stated: float) -> float | None:
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
-def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
+def shared_errors(window: BoardWindow, now: Present) -> dict[str, SharedErrors]:
     """What the corners of an image share, by the likelihood of all images of the window together.
 
     With u what they share (three errors an image), the normal equations are extended by u, and motion and
     constants are eliminated from them: S u = s + noise of covariance S. [docs/math/filter.md, eq. (12)]
     """
     out = {name: SharedErrors() for name in window.sigma_px}
-    now = window.present()
-    if now is None:
-        return out
     S, s = _shared_information(window, now)
     camera = np.repeat([list(out).index(view.camera) for view in now.views], WAYS)
     for _ in range(2 if len(out) > 1 else 1):  # each camera with what the others were found to have
@@ -147,8 +145,7 @@ def _shared_information(window: BoardWindow, now: Present) -> tuple[FloatArray, 
     n = WAYS * len(now.views)
     across, own, right = np.zeros((n, len(H))), np.zeros((n, n)), np.zeros(n)
     for k, (view, (W, _, r, *_)) in enumerate(zip(now.views, images, strict=True)):
-        state = window.at(window.nodes[view.node], view.camera)
-        ways = W @ (view.by_error @ shared_ways(state, window.layout, view.camera))
+        ways = W @ view.by_shared
         here = slice(WAYS * k, WAYS * k + WAYS)
         across[here, window.places(view.node)] = (ways.T @ W) @ view.by_error
         own[here, here], right[here] = ways.T @ ways, ways.T @ r
