@@ -123,11 +123,12 @@ def _reduce(problem: DriftProblem, with_bias: bool) -> _Reduced:
         rhs[p + 1 :, n // 2, BIAS] = np.eye(3)
     factor = cholesky_banded(_band(problem), lower=True, check_finite=False)
     Y, _ = dtbtrs(factor, rhs.reshape(-1, n * d).T, uplo="L", overwrite_b=1)
-    S = np.einsum("kip,kiq->pq", problem.J, WJ) - Y[:, :p].T @ Y[:, :p] + problem.prior_information
-    g = np.einsum("kip,ki->p", problem.J, We[..., 0]) - Y[:, :p].T @ Y[:, p]
+    rows = problem.J.reshape(-1, p).T
+    S = rows @ WJ.reshape(-1, p) - Y[:, :p].T @ Y[:, :p] + problem.prior_information
+    g = rows @ We.ravel() - Y[:, :p].T @ Y[:, p]
     P, log_det_S = _inverse(0.5 * (S + S.T))
     x = P @ g
-    squares = float(np.einsum("ki,ki->", problem.e, We[..., 0]) + information @ mean**2)
+    squares = float(problem.e.ravel() @ We.ravel() + information @ mean**2)
     quadratic = squares - float(Y[:, p] @ Y[:, p]) - float(g @ x)
     log_determinant = 2.0 * float(np.log(factor[0]).sum()) + log_det_S + problem.Q_log_determinant
     return _Reduced(factor, np.asarray(Y, dtype=np.float64), P, x, quadratic, log_determinant)
