@@ -183,8 +183,15 @@ class BoardWindow:
         return out
 
     # ------------------------------------------------------------------ the loop
-    def solve(self, now: Present) -> Present | None:
-        """Levenberg-Marquardt from the present values until nothing changes; None: that is not reached."""
+    def solve(self, now: Present) -> tuple[Present, list[Whitened]] | None:
+        """Levenberg-Marquardt until nothing changes.
+
+        Args:
+            now: All about the present values.
+
+        Returns:
+            All about those before the last step, and its images over their noise; None: that is not reached.
+        """
         images, damping = self.whitened(now), 0.0
         for _ in range(MOST_STEPS):
             self._learn_noise(now.views, images)
@@ -199,7 +206,8 @@ class BoardWindow:
             dx = cho_solve((root, True), g, check_finite=False)
             if float(g @ dx) < DONE and not damping:
                 self._move(dx)
-                return self.present() if self._relink() else None
+                self._follow_shifts()
+                return now, images
             cost = self._cost(now, images)
             before = self.state, self.offset, [n.at for n in self.nodes], self._links, self._measured
             self._move(dx)
@@ -267,13 +275,17 @@ class BoardWindow:
         t_cam_s, frame = node.frames[0]
         return t_cam_s + self._shift_s(frame.camera, node.at.t_s) - node.at.t_s
 
-    def _relink(self) -> bool:
-        """Move the instants to where time shifts have them; False where readings do not reach."""
+    def _follow_shifts(self) -> None:
+        """Move the instants to where time shifts have them."""
         for node, d in zip(self.nodes, [self._late_s(n) for n in self.nodes], strict=True):
             t_s, R, p, v = node.at
             R = orthonormal(R @ so3.exp_one(d * node.rates.omega))
             p = p + d * (v + 0.5 * d * node.rates.accel)
             node.at = Instant(t_s + d, R, p, v + d * node.rates.accel)
+
+    def _relink(self) -> bool:
+        """Move the instants, and integrate between them; False where readings do not reach."""
+        self._follow_shifts()
         links = _integrated(self.nodes, self.state, self._noise, self._buffer)
         if links is None:
             return False

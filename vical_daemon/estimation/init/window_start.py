@@ -16,7 +16,7 @@ from scipy.linalg import cho_solve, cholesky
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.board_window import BoardWindow, Present
+from vical_daemon.estimation.init.board_window import BoardWindow, Present, Whitened
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
@@ -81,11 +81,12 @@ def window_start(
     if window is None or now is None:
         return None
     try:  # as if corners were independent a shift of the image would count as motion
-        window.shared = {name: shared.sigmas for name, shared in shared_errors(window, now).items()}
-        now = window.solve(now)
-        if now is None:
+        before = shared_errors(window, now, window.whitened(now))
+        window.shared = {name: shared.sigmas for name, shared in before.items()}
+        solved = window.solve(now)
+        if solved is None:
             return None
-        shared = shared_errors(window, now)
+        shared = shared_errors(window, *solved)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     trial = window.filter(make(deepcopy(state)))
@@ -114,14 +115,14 @@ def _size(f: CalibrationFilter, stated: float) -> float | None:
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
-def shared_errors(window: BoardWindow, now: Present) -> dict[str, SharedErrors]:
+def shared_errors(window: BoardWindow, now: Present, images: list[Whitened]) -> dict[str, SharedErrors]:
     """What the corners of an image share, by the likelihood of all images of the window together.
 
     With u what they share (three errors an image), the normal equations are extended by u, and motion and
     constants are eliminated from them: S u = s + noise of covariance S. [docs/math/filter.md, eq. (12)]
     """
     out = {name: SharedErrors() for name in window.sigma_px}
-    S, s = _shared_information(window, now)
+    S, s = _shared_information(window, now, images)
     camera = np.repeat([list(out).index(view.camera) for view in now.views], WAYS)
     for _ in range(2 if len(out) > 1 else 1):  # each camera with what the others were found to have
         for k, (name, shared) in enumerate(out.items()):
@@ -138,9 +139,10 @@ def shared_errors(window: BoardWindow, now: Present) -> dict[str, SharedErrors]:
     return out
 
 
-def _shared_information(window: BoardWindow, now: Present) -> tuple[FloatArray, FloatArray]:
+def _shared_information(
+    window: BoardWindow, now: Present, images: list[Whitened]
+) -> tuple[FloatArray, FloatArray]:
     """Information on what corners share in each image, and right side; motion and constants eliminated."""
-    images = window.whitened(now)
     H, g = window.normal(now, images, together=False)
     n = WAYS * len(now.views)
     across, own, right = np.zeros((n, len(H))), np.zeros((n, n)), np.zeros(n)
