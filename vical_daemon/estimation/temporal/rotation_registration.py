@@ -18,7 +18,6 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, angles_between
 
 _WORLD_RAD = 0.2  # orientations that miss the usual one by more count less and less
-_DONE = 1e-4  # s and rad: far below the 50 ms and 10 deg with which the final polish may begin
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def closest_points(
 def closest_point_registration(
     curve: RotationCurve, t_cam_s: FloatArray, q_world_cam: FloatArray, start: Start
 ) -> Registration:
-    """Iterate pairing and registering until shift and rotations rest.
+    """Iterate pairing and registering until the shift rests (1 us) and the rotations do (1e-6 rad).
 
     Closest points pull the shift towards whatever makes residuals small, so its last digits are biased: the
     final polish of `td_icp` drops the pairs. This phase is for its width: it walks in from 100 ms off.
@@ -106,7 +105,7 @@ def closest_point_registration(
         q_imu_cam = so3.quat_multiply(q_imu_cam, so3.quat_from_rotvec(turn))
         q_world_ref = so3.quat_multiply(so3.quat_from_rotvec(d_world), q_world_ref)
         window = max(0.5 * window, 0.005)
-        done = abs(step) < _DONE and float(np.abs(turn).max()) < _DONE
+        done = abs(step) < 1e-6 and float(np.abs(turn).max()) < 1e-6
     return Registration(
         shift, so3.matrix_from_quat(q_imu_cam), so3.matrix_from_quat(q_world_ref), bias, weight, rounds
     )
