@@ -11,7 +11,6 @@ from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
@@ -22,6 +21,7 @@ from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
+from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.shared_errors import (
     JITTERS_S,
     SHIFTS_PX,
@@ -151,6 +151,5 @@ def _shared_information(
         here = slice(WAYS * k, WAYS * k + WAYS)
         across[here, window.places(view.node)] = (ways.T @ W) @ view.by_error
         own[here, here], right[here] = ways.T @ ways, ways.T @ r
-    solved = cho_solve((cholesky(H, lower=True), True), np.column_stack([across.T, g]))
-    S = own - across @ solved[:, :-1]
-    return 0.5 * (S + S.T), right - across @ solved[:, -1]
+    taken = solve_lower(root(H), np.column_stack([across.T, g]))
+    return own - taken[:, :-1].T @ taken[:, :-1], right - taken[:, :-1].T @ taken[:, -1]
