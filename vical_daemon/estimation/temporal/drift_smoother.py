@@ -10,12 +10,14 @@ states are eliminated by a banded Cholesky factorisation of their information, w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.model.unscented import root, solve_lower, unit
 
 BIAS = slice(3, 6)  # where the gyro bias stands in the state
 
@@ -80,11 +82,16 @@ def _band(problem: DriftProblem) -> FloatArray:
     D[1:] += problem.Q_inverse
     D[0] += np.diag(problem.first_information)
     band = np.zeros((2 * d, n, d))
-    rows, columns = np.tril_indices(d)
+    (rows, columns), (every, each) = _lower_and_all(d)
     band[rows - columns, :, columns] = D[:, rows, columns].T
-    rows, columns = np.divmod(np.arange(d * d), d)
-    band[d + rows - columns, :-1, columns] = -QF[:, rows, columns].T
+    band[d + every - each, :-1, each] = -QF[:, every, each].T
     return band.reshape(2 * d, n * d)
+
+
+@lru_cache(maxsize=8)
+def _lower_and_all(d: int) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray]]:
+    """Rows and columns of the lower triangle of a d by d matrix, and of all of it."""
+    return np.tril_indices(d), np.divmod(np.arange(d * d), d)
 
 
 @dataclass(frozen=True)
@@ -171,6 +178,6 @@ def _inverse(S: FloatArray) -> tuple[FloatArray, float]:
     if not (diagonal > 0.0).all():  # rounding, or numbers that are not finite
         raise np.linalg.LinAlgError("matrix is not positive definite")
     scale = 1.0 / np.sqrt(diagonal)
-    L = np.linalg.cholesky(S * np.outer(scale, scale))
-    inverse = np.linalg.inv(L) * scale
+    L = root(S * np.outer(scale, scale))
+    inverse = solve_lower(L, unit(len(S))) * scale
     return inverse.T @ inverse, 2.0 * float(np.log(np.diagonal(L)).sum() - np.log(scale).sum())
