@@ -147,10 +147,9 @@ class LinearisedFilter(CalibrationFilter):
         z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
         return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S))
 
-    def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
+    def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:  # noqa: ARG002
         """By the reference: it has been adjusted to all images, while the mean may have lost its way."""
-        by_mean = (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
-        return corner_gate(image, innovation + by_mean, lin)
+        return corner_gate(image, image.uv - self.known.views[image.camera, image.t_ns].z, lin)
 
     def _misses_gate(self, fit: ImageFit) -> bool:  # noqa: ARG002
         """Corners have been compared with the reference; errors over a hole in the images are no news."""

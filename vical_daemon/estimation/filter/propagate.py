@@ -14,7 +14,6 @@ from vical_daemon.estimation.inertial.imu_model import (
     Strapdown,
     compose,
     influence,
-    size_effect,
     strapdown,
 )
 from vical_daemon.estimation.measurements import FloatArray
@@ -118,11 +117,8 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         readings = np.concatenate([segment.gyro - state.gyro_bias, segment.accel - state.accel_bias], axis=1)
         by = by_entries(errors, readings, state.gyro_matrix, state.accel_matrix)
         F[:, BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
-    if layout.accel_positions is not None and segment.gyro_slope is not None:
-        rate, slope = segment.gyro - state.gyro_bias, segment.gyro_slope
-        F[:, layout.accel_positions] = by_apart(
-            errors, size_effect(rate @ state.gyro_matrix.T, slope @ state.gyro_matrix.T)
-        )
+    if layout.accel_positions is not None and relative.felt is not None:
+        F[:, layout.accel_positions] = by_apart(errors, relative.felt)
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
     return Propagated(

@@ -44,6 +44,7 @@ class Strapdown(NamedTuple):
         dp: Double integral, m, shape (S, n + 1, 3).
         t_s: Node times since the start, s, shape (n + 1,).
         clipping_sigma: See `ImuSegment`.
+        felt: `size_effect` at every node, shape (n + 1, 3, 3); None: all axes of it are at the origin.
     """
 
     dR: FloatArray
@@ -51,6 +52,7 @@ class Strapdown(NamedTuple):
     dp: FloatArray
     t_s: FloatArray
     clipping_sigma: FloatArray | None = None
+    felt: FloatArray | None = None
 
 
 def strapdown(
@@ -87,12 +89,13 @@ def strapdown(
         omega = omega @ gyro_matrix.swapaxes(-1, -2)
     if accel_matrix is not None:
         force = force @ accel_matrix.swapaxes(-1, -2)
-    turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
+    turn_slope, force_slope, felt = segment.gyro_slope, segment.accel_slope, None
     if turn_slope is not None and gyro_matrix is not None:
         turn_slope = turn_slope @ gyro_matrix[0].T
     if accel_positions is not None and turn_slope is not None:
         # hardly depends on the bias: the first of the batch stands for all
-        force = force - np.einsum("nij,sij->sni", size_effect(omega[0], turn_slope), accel_positions)
+        felt = size_effect(omega[0], turn_slope)
+        force = force - np.vecdot(felt, accel_positions[:, None])
     dR = products(rotation_steps(omega, dt, turn_slope))
     f_start = np.matvec(dR, force)
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
@@ -110,7 +113,7 @@ def strapdown(
         moved = (h * h) * (0.35 * before + 0.15 * after + h * (0.05 * first - last / 30.0))
     np.add.accumulate(gained, axis=1, out=dv[:, 1:])
     np.add.accumulate(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
-    return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.clipping_sigma)
+    return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.clipping_sigma, felt)
 
 
 def size_effect(rate: FloatArray, slope: FloatArray) -> FloatArray:

@@ -74,7 +74,7 @@ class View(NamedTuple):
         seen: Corners that can be predicted, shape (n,).
         ways: See `Linear`, shape (2n, k).
         by_error: See `Linear`, shape (k, size).
-        alike: Pixels by what corners share, each of unit variance, px, shape (2n, 3); (2n, 0): nothing.
+        by_shared: The ways by one unit of each of the errors that corners share, see `shared_ways`, (k, 3).
     """
 
     node: int
@@ -84,7 +84,7 @@ class View(NamedTuple):
     seen: BoolArray
     ways: FloatArray
     by_error: FloatArray
-    alike: FloatArray
+    by_shared: FloatArray
 
 
 class Whitened(NamedTuple):
@@ -92,7 +92,7 @@ class Whitened(NamedTuple):
 
     Attributes:
         ways: Of `View`, shape (2n, k).
-        alike: Likewise.
+        alike: Likewise by what corners share, each of unit variance, shape (2n, 3); (2n, 0): nothing.
         residual: Shape (2n,).
         left: Residuals without what corners share, px, shape (n, 2).
         square: Sum of squares of the residuals without what corners share, and of that; of corners that do
@@ -183,13 +183,17 @@ class BoardWindow:
         return out
 
     # ------------------------------------------------------------------ the loop
-    def solve(self) -> bool:
-        """Levenberg-Marquardt until nothing changes; False where that is not reached."""
-        now, damping = self.present(), 0.0
-        images = [] if now is None else self.whitened(now)
+    def solve(self, now: Present) -> tuple[Present, list[Whitened]] | None:
+        """Levenberg-Marquardt until nothing changes.
+
+        Args:
+            now: All about the present values.
+
+        Returns:
+            All about those before the last step, and its images over their noise; None: that is not reached.
+        """
+        images, damping = self.whitened(now), 0.0
         for _ in range(MOST_STEPS):
-            if now is None:
-                return False
             self._learn_noise(now.views, images)
             images = self.whitened(now)
             H, g = self.normal(now, images)
@@ -202,12 +206,13 @@ class BoardWindow:
             dx = cho_solve((root, True), g, check_finite=False)
             if float(g @ dx) < DONE and not damping:
                 self._move(dx)
-                return self._relink()
+                self._follow_shifts()
+                return now, images
             cost = self._cost(now, images)
             before = self.state, self.offset, [n.at for n in self.nodes], self._links, self._measured
             self._move(dx)
             if self._stale() and not self._relink():
-                return False
+                return None
             trial = self.present()
             beyond = [] if trial is None else self.whitened(trial)
             if trial is None or not self._cost(trial, beyond) < cost + DONE:
@@ -218,7 +223,7 @@ class BoardWindow:
                 damping = max(10.0 * damping, 1e-9)
                 continue
             now, images, damping = trial, beyond, 0.1 * damping if damping > 1e-9 else 0.0
-        return False
+        return None
 
     def filter(self, prior: CalibrationFilter) -> LinearisedFilter:
         """A filter that knows what `prior` knows, linearised about the window; `prior` is used up.
@@ -270,13 +275,17 @@ class BoardWindow:
         t_cam_s, frame = node.frames[0]
         return t_cam_s + self._shift_s(frame.camera, node.at.t_s) - node.at.t_s
 
-    def _relink(self) -> bool:
-        """Move the instants to where time shifts have them; False where readings do not reach."""
+    def _follow_shifts(self) -> None:
+        """Move the instants to where time shifts have them."""
         for node, d in zip(self.nodes, [self._late_s(n) for n in self.nodes], strict=True):
             t_s, R, p, v = node.at
             R = orthonormal(R @ so3.exp_one(d * node.rates.omega))
             p = p + d * (v + 0.5 * d * node.rates.accel)
             node.at = Instant(t_s + d, R, p, v + d * node.rates.accel)
+
+    def _relink(self) -> bool:
+        """Move the instants, and integrate between them; False where readings do not reach."""
+        self._follow_shifts()
         links = _integrated(self.nodes, self.state, self._noise, self._buffer)
         if links is None:
             return False
@@ -326,10 +335,8 @@ class BoardWindow:
             return None
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
-        alike = np.zeros((len(ways), 0))
-        if name in self.shared:
-            alike = ways @ (by_error @ (shared_ways(state, self.layout, name) * self.shared[name]))
-        return View(k, name, residual, relative, seen, ways, by_error, alike)
+        by_shared = by_error @ shared_ways(state, self.layout, name)
+        return View(k, name, residual, relative, seen, ways, by_error, by_shared)
 
     def _linked(self) -> tuple[FloatArray, FloatArray]:
         """See `Present`: missed, by_link."""
@@ -366,11 +373,10 @@ class BoardWindow:
         H, g = np.zeros((n, n)), np.zeros(n)
 
         def add(A: FloatArray, b: FloatArray, first: int) -> None:
-            own = slice(first, first + len(A) - n + F)
-            k = own.stop - own.start
+            k = len(A) - n + F
+            own = slice(first, first + k)
             H[own, own] += A[:k, :k]
             H[own, F:] += A[:k, k:]
-            H[F:, own] += A[k:, :k]
             H[F:, F:] += A[k:, k:]
             g[own] += b[:k]
             g[F:] += b[k:]
@@ -384,6 +390,7 @@ class BoardWindow:
             add(view.by_error.T @ information @ view.by_error, view.by_error.T @ right, 9 * view.node)
         for k, (e, J) in enumerate(zip(now.missed, now.by_link, strict=True)):
             add(J.T @ J, -J.T @ e, 9 * k)
+        H[F:, :F] = H[:F, F:].T
         H[F:, F:] += self._information
         g[F:] -= self._information @ self.offset
         return H, g
@@ -399,19 +406,21 @@ class BoardWindow:
         return [self._whitened(*pair) for pair in zip(now.views, noise, strict=True)]
 
     def _whitened(self, view: View, noise: float) -> Whitened:
-        sigma = self.sigma_px[view.camera] * noise * view.relative
+        sigma, sigmas = self.sigma_px[view.camera] * noise * view.relative, self.shared.get(view.camera)
+        unit = view.by_shared[:, :0] if sigmas is None else view.by_shared * sigmas
         left = view.residual
-        for _ in range(2 if view.alike.size else 1):
+        for _ in range(2 if unit.size else 1):
             far = np.vecdot(left, left) / sigma**2
             weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / SURE_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
-            A, r = view.alike * twice[:, None], view.residual.ravel() * twice
+            W, r = view.ways * twice[:, None], view.residual.ravel() * twice
+            A = W @ unit
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
-            left = view.residual - (view.alike @ shared).reshape(-1, 2)
+            left = view.residual - (view.ways @ (unit @ shared)).reshape(-1, 2)
         far = np.vecdot(left, left) / sigma**2
         # what is lost from sight costs as much as a gross outlier
         cost = np.where(view.seen, far / (1.0 + far / SURE_SIGMAS**2), SURE_SIGMAS**2)
-        return Whitened(view.ways * twice[:, None], A, r, left, float(cost.sum() + shared @ shared))
+        return Whitened(W, A, r, left, float(cost.sum() + shared @ shared))
 
     def _cost(self, now: Present, images: list[Whitened]) -> float:
         """Sum of squares."""

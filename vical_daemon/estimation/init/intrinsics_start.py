@@ -6,13 +6,13 @@ Only a start: the filter estimates the same eight numbers with everything else.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
 from vical_daemon.estimation.init.target_poses import ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
@@ -113,7 +113,7 @@ def adjusted(
         normal = _normal(views, poses, target, theta, lens.distortion_model)
         if normal is None:
             break
-        new_cost = normal.cost + float((((theta - prior) / scale) ** 2).sum())
+        new_cost = float(normal.squares[0, 0]) + float((((theta - prior) / scale) ** 2).sum())
         if new_cost < cost:
             done = cost - new_cost < 1e-6 * new_cost
             best, cost, damping = (theta, poses), new_cost, damping * 0.3
@@ -138,41 +138,36 @@ def _scale(lens: CameraState) -> FloatArray:
 
 
 def along(
-    fit: LensFit, lens: CameraState, target: FloatArray, moves: list[FloatArray]
-) -> tuple[float, float]:
+    fit: LensFit, lens: CameraState, target: FloatArray, moves: Sequence[FloatArray]
+) -> list[tuple[float, float]]:
     """How the squared residuals change if all corners move, and lens and poses follow them.
 
     Args:
         fit: Of the corners where they are.
         lens: As it was before the fit.
         target: Points of the target, m, shape (n, 3).
-        moves: How the corners of each of its views move, px, shape (n, 2).
+        moves: Ways in which the corners of all its views, one after the other, move, px, shape (n, 2).
 
     Returns:
-        Half the first and half the second derivative of their sum by the share of `moves`, px^2; zeros where
-        a corner lies behind its camera.
+        For each way, half the first and half the second derivative of their sum by the share of it, px^2;
+        zeros where a corner lies behind its camera.
     """
-    here, up, down = (
-        _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.distortion_model)
-        for share in (0.0, 1.0, -1.0)
-    )
-    if here is None or up is None or down is None:
-        return 0.0, 0.0
-    right = here._replace(b=0.5 * (up.b - down.b), c=0.5 * (up.c - down.c))
-    of_lens, of_poses = right.solve(np.zeros(len(fit.theta)), _scale(lens) ** -2.0, 1e-9)
-    taken = float(of_lens @ right.b) + float((of_poses * right.c).sum())
-    return 0.25 * (up.cost - down.cost), 0.5 * (up.cost + down.cost) - here.cost - taken
-
-
-def _moved(views: list[PointsFrame], moves: list[FloatArray], share: float) -> list[PointsFrame]:
-    return [replace(v, uv_px=v.uv_px + share * m) for v, m in zip(views, moves, strict=True)]
+    normal = _normal(fit.views, fit.poses, target, fit.theta, lens.distortion_model, moves)
+    if normal is None:
+        return [(0.0, 0.0)] * len(moves)
+    out = []
+    for k in range(1, len(moves) + 1):
+        of_lens, of_poses = normal.solve(np.zeros(len(fit.theta)), _scale(lens) ** -2.0, 1e-9, k)
+        taken = float(of_lens @ normal.b[:, k]) + float((of_poses * normal.c[..., k]).sum())
+        out.append((float(normal.squares[0, k]), float(normal.squares[k, k]) - taken))
+    return out
 
 
 def _without_outliers(
     view: PointsFrame, R: FloatArray, p: FloatArray, target: FloatArray, theta: FloatArray, model: str
 ) -> PointsFrame:
     """The view without the corners that do not belong."""
-    uv = project_jacobians(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)[0]
+    uv = project(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)
     far = np.linalg.norm(view.uv_px - uv, axis=1)
     good = inliers(far)
     if good.all() or good.sum() < _LEAST_POINTS:
@@ -208,12 +203,12 @@ def _poses(views: list[PointsFrame], lens: CameraState, target: FloatArray) -> t
 
 
 class _Normal(NamedTuple):
-    """Normal equations of a lens and m poses.
+    """Normal equations of a lens and m poses, for residuals and k ways in which corners move.
 
     Attributes:
-        A, b: Of the lens, shapes (n, n), (n,).
-        P, C, c: Of each pose, with the lens, and its right side; shapes (m, 6, 6), (m, 6, n), (m, 6).
-        cost: Sum of squares, px^2.
+        A, b: Of the lens, and its right sides, shapes (n, n), (n, 1 + k).
+        P, C, c: Of each pose, with the lens, and its right sides; shapes (m, 6, 6), (m, 6, n), (m, 6, 1 + k).
+        squares: Sums of squares and products, px^2, shape (1 + k, 1 + k).
     """
 
     A: FloatArray
@@ -221,9 +216,11 @@ class _Normal(NamedTuple):
     P: FloatArray
     C: FloatArray
     c: FloatArray
-    cost: float
+    squares: FloatArray
 
-    def solve(self, b0: FloatArray, a0: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
+    def solve(
+        self, b0: FloatArray, a0: FloatArray, damping: float, side: int = 0
+    ) -> tuple[FloatArray, FloatArray]:
         """Steps of the lens, shape (n,), and of the poses, shape (m, 6), by Schur complement."""
         A = self.A + np.diag(a0)
         A += damping * np.diag(np.diag(A))
@@ -231,9 +228,9 @@ class _Normal(NamedTuple):
         inverse = np.linalg.inv(self.P + damping * diagonals)
         reduced = np.matmul(inverse, self.C)
         A -= np.tensordot(self.C, reduced, axes=((0, 1), (0, 1)))
-        b = self.b + b0 - np.tensordot(reduced, self.c, axes=((0, 1), (0, 1)))
-        d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
-        return d, np.matvec(inverse, self.c - self.C @ d)
+        b, c = self.b[:, side] + b0, self.c[..., side]
+        d = np.asarray(np.linalg.solve(A, b - np.tensordot(reduced, c, axes=((0, 1), (0, 1)))), np.float64)
+        return d, np.matvec(inverse, c - self.C @ d)
 
 
 def _normal(
@@ -242,6 +239,7 @@ def _normal(
     target: FloatArray,
     theta: FloatArray,
     model: str,
+    moves: Sequence[FloatArray] = (),
 ) -> _Normal | None:
     """All corners at once, summed up by view; None: some lie behind their camera."""
     n = len(theta)
@@ -252,14 +250,21 @@ def _normal(
     uv, J_point, J_lens = project_jacobians(x, theta[:4], theta[4:], model)
     if not np.isfinite(uv).all():
         return None
-    rows = np.empty((len(X), 2, 7 + n))
+    rows = np.empty((len(X), 2, 7 + n + len(moves)))
     rows[..., :3] = J_point
     turned = np.concatenate([J_point[at] @ R for at, (R, _) in zip(each, poses, strict=True)])
     rows[..., 3:6] = so3.cross(X[:, None], turned)  # j' R (d x X) = (X x R' j)' d
     rows[..., 6 : 6 + n] = J_lens
     rows[..., 6 + n] = np.concatenate([v.uv_px for v in views]) - uv
-    sums = np.array([(w := rows[at].reshape(-1, 7 + n)).T @ w for at in each])
+    for k, move in enumerate(moves):
+        rows[..., 7 + n + k] = move
+    sums = np.array([(w := rows[at].reshape(-1, rows.shape[2])).T @ w for at in each])
     whole = sums[:, 6:, 6:].sum(axis=0)
     return _Normal(
-        whole[:n, :n], whole[:n, n], sums[:, :6, :6], sums[:, :6, 6:-1], sums[:, :6, -1], float(whole[n, n])
+        whole[:n, :n],
+        whole[:n, n:],
+        sums[:, :6, :6],
+        sums[:, :6, 6 : 6 + n],
+        sums[:, :6, 6 + n :],
+        whole[n:, n:],
     )

@@ -94,14 +94,12 @@ def _parabolas(
     frames: Frames, lens: CameraState, target: FloatArray, fit: LensFit, axes: Sequence[str]
 ) -> list[tuple[float, float]]:
     """Half the first and second derivative of the squared residuals by the readout, px^2/s and px^2/s^2."""
-    own = [
-        (frames[k][1].uv_px[kept], speed[kept])
-        for k, view, speed in zip(fit.which, fit.views, corner_speeds(frames, fit.which), strict=True)
-        for kept in [np.isin(frames[k][1].ids, view.ids)]
-    ]
-    out = []
-    for axis in axes:
-        moves = [-read_share(uv_px, lens.resolution, axis)[:, None] * speed for uv_px, speed in own]
-        slope, bend = along(fit, lens, target, moves)
-        out.append((slope, max(bend, 1.0)))  # without any motion a second of readout moves nothing
-    return out
+    own = np.concatenate(
+        [
+            np.hstack([frames[k][1].uv_px, speed])[np.isin(frames[k][1].ids, view.ids)]
+            for k, view, speed in zip(fit.which, fit.views, corner_speeds(frames, fit.which), strict=True)
+        ]
+    )
+    moves = [-read_share(own[:, :2], lens.resolution, axis)[:, None] * own[:, 2:] for axis in axes]
+    # without any motion a second of readout moves nothing
+    return [(slope, max(bend, 1.0)) for slope, bend in along(fit, lens, target, moves)]

@@ -49,8 +49,7 @@ def spacing_ratio(
     if fit is None:
         return 1.0
     step, bend = _step(fit, lens, target)
-    rolls = bend * step**2 < most_of_a_readout(frames, lens, target, fit)
-    if abs(step) < _LEAST or rolls:
+    if abs(step) < _LEAST or bend * step**2 < most_of_a_readout(frames, lens, target, fit):
         return 1.0
     fits = {0.0: fit}
     for tried in _TRIED:
@@ -75,16 +74,14 @@ def spacing_ratio(
 
 def _step(fit: LensFit, lens: CameraState, target: FloatArray) -> tuple[float, float]:
     """Change of the logarithm with which images fit best, and half the second derivative by it, px^2."""
-    slope, bend = along(fit, lens, target, _moves(fit, lens, target))
+    [(slope, bend)] = along(fit, lens, target, [_moves(fit, lens, target)])
     return (-slope / bend, bend) if bend > 0.0 else (0.0, 0.0)
 
 
-def _moves(fit: LensFit, lens: CameraState, target: FloatArray) -> list[FloatArray]:
-    """How the residuals of each view move with the logarithm of the ratio, px, shape (n, 2)."""
-    moves = []
-    for view, (R, p) in zip(fit.views, fit.poses, strict=True):
-        points = target[view.ids]
-        by_point = project_jacobians(points @ R.T + p, fit.theta[:4], fit.theta[4:], lens.distortion_model)[1]
-        wider = points * np.array([0.5, -0.5, 0.0])
-        moves.append(-np.einsum("nij,nj->ni", by_point, wider @ R.T))
-    return moves
+def _moves(fit: LensFit, lens: CameraState, target: FloatArray) -> FloatArray:
+    """How the residuals of all views move with the logarithm of the ratio, px, shape (n, 2)."""
+    both = np.stack([target, target * np.array([0.5, -0.5, 0.0])])  # points, and how they move
+    seen = [both[:, v.ids] @ R.T for v, (R, _) in zip(fit.views, fit.poses, strict=True)]
+    points = np.concatenate([x[0] + p for x, (_, p) in zip(seen, fit.poses, strict=True)])
+    by_point = project_jacobians(points, fit.theta[:4], fit.theta[4:], lens.distortion_model)[1]
+    return np.asarray(-np.matvec(by_point, np.concatenate([x[1] for x in seen])))

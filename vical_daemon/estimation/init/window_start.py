@@ -11,23 +11,22 @@ from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.board_window import BoardWindow, Present
+from vical_daemon.estimation.init.board_window import BoardWindow, Present, Whitened
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
+from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.shared_errors import (
     JITTERS_S,
     SHIFTS_PX,
     WAYS,
     SharedErrors,
-    shared_ways,
 )
 from vical_daemon.estimation.noise.variance_components import of_window
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -78,13 +77,16 @@ def window_start(
         The start, or None where the data do not hold together.
     """
     window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
-    if window is None:
+    now = None if window is None else window.present()
+    if window is None or now is None:
         return None
     try:  # as if corners were independent a shift of the image would count as motion
-        window.shared = {name: shared.sigmas for name, shared in shared_errors(window).items()}
-        if not window.solve():
+        before = shared_errors(window, now, window.whitened(now))
+        window.shared = {name: shared.sigmas for name, shared in before.items()}
+        solved = window.solve(now)
+        if solved is None:
             return None
-        shared = shared_errors(window)
+        shared = shared_errors(window, *solved)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     trial = window.filter(make(deepcopy(state)))
@@ -113,17 +115,14 @@ def _size(f: CalibrationFilter, stated: float) -> float | None:
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
-def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
+def shared_errors(window: BoardWindow, now: Present, images: list[Whitened]) -> dict[str, SharedErrors]:
     """What the corners of an image share, by the likelihood of all images of the window together.
 
     With u what they share (three errors an image), the normal equations are extended by u, and motion and
     constants are eliminated from them: S u = s + noise of covariance S. [docs/math/filter.md, eq. (12)]
     """
     out = {name: SharedErrors() for name in window.sigma_px}
-    now = window.present()
-    if now is None:
-        return out
-    S, s = _shared_information(window, now)
+    S, s = _shared_information(window, now, images)
     camera = np.repeat([list(out).index(view.camera) for view in now.views], WAYS)
     for _ in range(2 if len(out) > 1 else 1):  # each camera with what the others were found to have
         for k, (name, shared) in enumerate(out.items()):
@@ -140,18 +139,17 @@ def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
     return out
 
 
-def _shared_information(window: BoardWindow, now: Present) -> tuple[FloatArray, FloatArray]:
+def _shared_information(
+    window: BoardWindow, now: Present, images: list[Whitened]
+) -> tuple[FloatArray, FloatArray]:
     """Information on what corners share in each image, and right side; motion and constants eliminated."""
-    images = window.whitened(now)
     H, g = window.normal(now, images, together=False)
     n = WAYS * len(now.views)
     across, own, right = np.zeros((n, len(H))), np.zeros((n, n)), np.zeros(n)
     for k, (view, (W, _, r, *_)) in enumerate(zip(now.views, images, strict=True)):
-        state = window.at(window.nodes[view.node], view.camera)
-        ways = W @ (view.by_error @ shared_ways(state, window.layout, view.camera))
+        ways = W @ view.by_shared
         here = slice(WAYS * k, WAYS * k + WAYS)
         across[here, window.places(view.node)] = (ways.T @ W) @ view.by_error
         own[here, here], right[here] = ways.T @ ways, ways.T @ r
-    solved = cho_solve((cholesky(H, lower=True), True), np.column_stack([across.T, g]))
-    S = own - across @ solved[:, :-1]
-    return 0.5 * (S + S.T), right - across @ solved[:, -1]
+    taken = solve_lower(root(H), np.column_stack([across.T, g]))
+    return own - taken[:, :-1].T @ taken[:, :-1], right - taken[:, :-1].T @ taken[:, -1]

@@ -56,9 +56,8 @@ def by_apart(errors: Influence, felt: FloatArray) -> FloatArray:
         errors: What errors of rate and force do to the end.
         felt: `size_effect` at each reading, shape (n + 1, 3, 3).
     """
-    weighted = errors.weights[:, None, None] * errors.at[:, :, 3:6]
-    by_position = -np.einsum("nei,nij->eij", weighted, felt)
-    return np.asarray(np.einsum("eij,ia->eaj", by_position, _SPREAD).reshape(9, 6), dtype=np.float64)
+    force = (-errors.weights[:, None, None] * felt)[:, :, None] * _SPREAD[:, :, None]  # node, axis, number
+    return np.asarray(errors.at[:, :, 3:6].transpose(1, 0, 2).reshape(9, -1) @ force.reshape(-1, 6))
 
 
 def by_entries(

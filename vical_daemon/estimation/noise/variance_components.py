@@ -8,19 +8,20 @@ few images do not distinguish the two, and then both are allowed for.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
-from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 STEP = 1.2
 """Ratio of neighbours on the grid: a sigma between two is met to a tenth."""
 SIZE = 30
 """Standard deviations on the grid: none, and 29 that span a factor of 165."""
-_COARSE = 4  # each fourth is enough for the likelihood of a window, which is a few images wide
+_FEW = np.array([0, *range(1, SIZE, 4)])
+"""Each fourth is enough for the likelihood of a window, which is a few images wide."""
 PRESENT = 0.5
 """Prior probability that an error is there at all."""
 
@@ -98,20 +99,17 @@ def of_window(S: FloatArray, s: FloatArray, first: FloatArray, others: FloatArra
     Returns:
         Shape (SIZE, SIZE).
     """
-    few = np.concatenate([[0], np.arange(1, SIZE, _COARSE)])
-    out = np.zeros((len(few), len(few)))
-    kind = np.arange(len(s)) % 3 > 0
-    for i, a in enumerate(first[few]):
-        for j, c in enumerate(others[few]):
-            root = np.where(kind, c, a)
-            M = root[:, None] * S * root
-            M[np.diag_indices_from(M)] += 1.0
-            L = cholesky(M, lower=True, overwrite_a=True, check_finite=False)
-            z = solve_triangular(L, root * s, lower=True, check_finite=False)
-            out[i, j] = 0.5 * float(z @ z) - float(np.log(np.diag(L)).sum())
-    for _ in range(2):  # along one axis, then along the other
-        out = np.concatenate([out[:1], _between(few[1:], np.arange(1, SIZE)) @ out[1:]]).T
-    return out
+    x, y = first[_FEW, None] ** 2, others[_FEW, None] ** 2
+    one, rest = slice(None, None, 3), np.flatnonzero(np.arange(len(s)) % 3)
+    # of each variance of the others, these are eliminated; eigenvalues give all variances of the first
+    found, V = np.linalg.eigh(S[np.ix_(rest, rest)])
+    found, across, b = np.maximum(found, 0.0), S[one, rest] @ V, s[rest] @ V
+    gain = y / (1.0 + y * found)
+    left, U = np.linalg.eigh(S[one, one] - (gain[:, None] * across) @ across.T)
+    left, a = np.maximum(left, 0.0)[:, None], np.vecmat(s[one] - (gain * b) @ across.T, U)[:, None]
+    explained = (gain @ b**2)[:, None] + (a**2 * x / (1.0 + x * left)).sum(axis=2)
+    out = 0.5 * (explained - np.log1p(y * found).sum(axis=1)[:, None] - np.log1p(x * left).sum(axis=2)).T
+    return np.asarray(_from_few() @ out @ _from_few().T)
 
 
 def posterior(log_likelihood: FloatArray, first: FloatArray, others: FloatArray) -> Variances:
@@ -125,15 +123,16 @@ def posterior(log_likelihood: FloatArray, first: FloatArray, others: FloatArray)
     return Variances(mean, np.array([by_first[0], by_others[0]]))
 
 
-def _between(nodes: IntArray, places: IntArray) -> FloatArray:
-    """Weights of values at `nodes` that interpolate at `places`: cubics through the four nearest."""
-    out = np.zeros((len(places), len(nodes)))
-    first = np.clip(np.searchsorted(nodes, places) - 2, 0, len(nodes) - 4)
-    for row, at, place in zip(out, first, places, strict=True):
-        x = nodes[at : at + 4]
-        for k in range(4):
-            others = np.delete(x, k)
-            row[at + k] = np.prod((place - others) / (x[k] - others))
+@lru_cache(maxsize=1)
+def _from_few() -> FloatArray:
+    """Weights of the values at `_FEW` that interpolate at all: cubics through the four nearest but 0."""
+    nodes, out = _FEW[1:], np.zeros((SIZE, len(_FEW)))
+    out[0, 0] = 1.0
+    for place in range(1, SIZE):
+        at = min(max(int(nodes.searchsorted(place)) - 2, 0), len(nodes) - 4)
+        for k, node in enumerate(nodes[at : at + 4]):
+            others = np.delete(nodes[at : at + 4], k)
+            out[place, 1 + at + k] = np.prod((place - others) / (node - others))
     return out
 
 

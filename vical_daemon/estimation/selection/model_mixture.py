@@ -83,7 +83,8 @@ def hypotheses(S: FloatArray, every: Mapping[str, Block], less: float) -> Weight
     """
     if not every:
         return {(): 1.0}
-    blocks = list(every.values())
+    names = sorted(every, key=lambda name: -len(every[name].values))  # see `_of_submatrices`
+    blocks = [every[name] for name in names]
     sigma = np.concatenate([b.sigma for b in blocks])
     values, noise = _of_all(blocks)
     rows = np.concatenate([S[b.where] for b in blocks]) / sigma[:, None]
@@ -92,7 +93,7 @@ def hypotheses(S: FloatArray, every: Mapping[str, Block], less: float) -> Weight
     sizes = [len(b.values) for b in blocks]
     logs -= log_bayes_factors(values / sigma, rows @ rows.T, sizes, less, noise / sigma)
     shares = np.exp(logs - logs.max())
-    return dict(zip(_named(tuple(every)), (shares / shares.sum()).tolist(), strict=True))
+    return dict(zip(_named(tuple(names), tuple(every)), (shares / shares.sum()).tolist(), strict=True))
 
 
 def _of_all(blocks: Collection[Block]) -> tuple[FloatArray, FloatArray]:
@@ -107,9 +108,9 @@ def _subsets(count: int) -> BoolArray:
 
 
 @lru_cache(maxsize=16)
-def _named(names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """The same by name."""
-    return [tuple(compress(names, row)) for row in _subsets(len(names))]
+def _named(names: tuple[str, ...], order: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """The same by name, each in another order."""
+    return [tuple(sorted(compress(names, row), key=order.index)) for row in _subsets(len(names))]
 
 
 def not_zero(shares: Weights, name: str) -> float:
@@ -278,7 +279,8 @@ def log_bayes_factors(
 def _of_submatrices(A: FloatArray, x: FloatArray, sizes: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """Log det A and x' A^-1 x of all submatrices of some blocks, in the order of `_subsets`.
 
-    Block by block, by Schur complements: what two submatrices begin with is eliminated once.
+    Block by block, by Schur complements: what two submatrices begin with is eliminated once. That is quickest
+    with large blocks first, as long as few submatrices differ.
 
     Args:
         A: Several matrices, shape (m, k, k).

@@ -122,8 +122,8 @@ class ImageOffsets:
         F, n = len(at) + 1, len(self.ways)
         G = np.zeros((F, n, size))
         k, way = np.arange(F - 1)[:, None, None], np.arange(n)[None, :, None]
-        G[k, way, at[:, None, :]] += np.einsum("miw,mic->mwc", self._begin, J)
-        G[k + 1, way, at[:, None, :]] += np.einsum("miw,mic->mwc", self._end, J)
+        G[k, way, at[:, None, :]] += np.swapaxes(self._begin, 1, 2) @ J
+        G[k + 1, way, at[:, None, :]] += np.swapaxes(self._end, 1, 2) @ J
         return G.reshape(F * n, size)
 
     def eliminate(self, H: FloatArray, g: FloatArray, J: FloatArray, at: IntArray) -> None:

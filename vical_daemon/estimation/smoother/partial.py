@@ -32,7 +32,7 @@ def still_axis(t_s: FloatArray, gyro_rps: FloatArray, bias_rps: FloatArray) -> F
         bias_rps: Of the gyro, rad/s, shape (3,).
     """
     curve = GyroCurve.integrate(t_s, gyro_rps, bias_rps)
-    axes = still_axes(so3.matrix_from_quat(curve.q_ref_imu).mean(axis=0))
+    axes = still_axes(curve.R_ref_imu.mean(axis=0))
     return axes[0] if len(axes) == 1 else None
 
 

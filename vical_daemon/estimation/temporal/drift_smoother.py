@@ -10,12 +10,14 @@ states are eliminated by a banded Cholesky factorisation of their information, w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.model.unscented import root, solve_lower, unit
 
 BIAS = slice(3, 6)  # where the gyro bias stands in the state
 
@@ -80,11 +82,16 @@ def _band(problem: DriftProblem) -> FloatArray:
     D[1:] += problem.Q_inverse
     D[0] += np.diag(problem.first_information)
     band = np.zeros((2 * d, n, d))
-    rows, columns = np.tril_indices(d)
+    (rows, columns), (every, each) = _lower_and_all(d)
     band[rows - columns, :, columns] = D[:, rows, columns].T
-    rows, columns = np.divmod(np.arange(d * d), d)
-    band[d + rows - columns, :-1, columns] = -QF[:, rows, columns].T
+    band[d + every - each, :-1, each] = -QF[:, every, each].T
     return band.reshape(2 * d, n * d)
+
+
+@lru_cache(maxsize=8)
+def _lower_and_all(d: int) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray]]:
+    """Rows and columns of the lower triangle of a d by d matrix, and of all of it."""
+    return np.tril_indices(d), np.divmod(np.arange(d * d), d)
 
 
 @dataclass(frozen=True)
@@ -123,11 +130,12 @@ def _reduce(problem: DriftProblem, with_bias: bool) -> _Reduced:
         rhs[p + 1 :, n // 2, BIAS] = np.eye(3)
     factor = cholesky_banded(_band(problem), lower=True, check_finite=False)
     Y, _ = dtbtrs(factor, rhs.reshape(-1, n * d).T, uplo="L", overwrite_b=1)
-    S = np.einsum("kip,kiq->pq", problem.J, WJ) - Y[:, :p].T @ Y[:, :p] + problem.prior_information
-    g = np.einsum("kip,ki->p", problem.J, We[..., 0]) - Y[:, :p].T @ Y[:, p]
+    rows = problem.J.reshape(-1, p).T
+    S = rows @ WJ.reshape(-1, p) - Y[:, :p].T @ Y[:, :p] + problem.prior_information
+    g = rows @ We.ravel() - Y[:, :p].T @ Y[:, p]
     P, log_det_S = _inverse(0.5 * (S + S.T))
     x = P @ g
-    squares = float(np.einsum("ki,ki->", problem.e, We[..., 0]) + information @ mean**2)
+    squares = float(problem.e.ravel() @ We.ravel() + information @ mean**2)
     quadratic = squares - float(Y[:, p] @ Y[:, p]) - float(g @ x)
     log_determinant = 2.0 * float(np.log(factor[0]).sum()) + log_det_S + problem.Q_log_determinant
     return _Reduced(factor, np.asarray(Y, dtype=np.float64), P, x, quadratic, log_determinant)
@@ -170,6 +178,6 @@ def _inverse(S: FloatArray) -> tuple[FloatArray, float]:
     if not (diagonal > 0.0).all():  # rounding, or numbers that are not finite
         raise np.linalg.LinAlgError("matrix is not positive definite")
     scale = 1.0 / np.sqrt(diagonal)
-    L = np.linalg.cholesky(S * np.outer(scale, scale))
-    inverse = np.linalg.inv(L) * scale
+    L = root(S * np.outer(scale, scale))
+    inverse = solve_lower(L, unit(len(S))) * scale
     return inverse.T @ inverse, 2.0 * float(np.log(np.diagonal(L)).sum() - np.log(scale).sum())

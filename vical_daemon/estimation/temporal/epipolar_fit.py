@@ -137,7 +137,7 @@ class _Fit:
         fit_lens: bool,
     ) -> None:
         self.t_imu, self.gyro, self.t_cam = t_imu, gyro, t_cam
-        self.pairs, self.fit_lens = pairs, fit_lens
+        self.pairs, self.fit_lens, self.lens_free = pairs, fit_lens, False
         self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
         self.given = (lens[0].copy(), lens[1].copy())
         self.gyro_density: float | None = None
@@ -175,6 +175,7 @@ class _Fit:
         bias = np.zeros(3)
         weight = np.where(self.ok, 1.0, 0.0)
         for step in range(_ITERATIONS):
+            self.lens_free = self.fit_lens and step >= _LENS_AFTER  # first with the lens as given
             lin = self._linearise(R, shift, bias)
             if lin is None:
                 return None
@@ -182,11 +183,9 @@ class _Fit:
             spread = sigma_by_median(e[self.ok]) + 1e-9
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, geman_mcclure_weight((e / (k * spread)) ** 2), 0.0)
-            size = 7 if step < _LENS_AFTER else J.shape[1]  # first with the lens as given
-            H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
-            if size > 7 and step == _LENS_AFTER:
-                self.lasting = self._errors_last(H, each)
-            if size > 7:
+            H, g, each = self._normal(e, J, Jt, weight / spread**2)
+            if self.lens_free:
+                self.lasting = self._errors_last(H, each) if step == _LENS_AFTER else self.lasting
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
             self._prior(H, g, bias)
             dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
@@ -194,7 +193,7 @@ class _Fit:
             R = R @ so3.exp(dx[:3])
             shift += float(dx[3])
             bias = bias + dx[4:7]
-            if size > 7:
+            if self.lens_free:
                 self.intrinsics = self.intrinsics + dx[7:11]
                 self.distortion = self.distortion + dx[11:]
                 self._rays()
@@ -263,18 +262,18 @@ class _Fit:
         ta, tb = so3.cross(d, self.a), so3.cross(d, b)
         length = np.sqrt(np.vecdot(ta, ta) + np.vecdot(tb, tb)) + 1e-6
         e = np.where(usable, np.vecdot(d, n) / length, 0.0)
-        if self.fit_lens:
+        if self.lens_free:
             across = ta[:, :2] ** 2 + tb[:, :2] ** 2
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
         back = np.matvec(np.take(np.swapaxes(R12, 1, 2), p.of, axis=0), ta)
         local = so3.cross(self.b, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
-        J = np.einsum("ni,nik->nk", local, np.take(by_turn, p.of, axis=0))
-        if self.fit_lens:
-            lens = np.einsum("ni,nik->nk", back, self.dray[1]) - np.einsum("ni,nik->nk", tb, self.dray[0])
+        J = np.vecmat(local, np.take(by_turn, p.of, axis=0))
+        if self.lens_free:
+            lens = np.vecmat(back, self.dray[1]) - np.vecmat(tb, self.dray[0])
             J = np.concatenate([J, lens], axis=1)
-        Jt = np.einsum("ni,nik->nk", n, Bt)
+        Jt = np.vecmat(n, Bt)
         if self.gyro_density is not None:
             share = (usable / length)[:, None]
             turned = np.matvec((A2 @ R)[p.of], local)
@@ -467,7 +466,7 @@ class _Fit:
     def _without_direction(self, J: FloatArray, Jt: FloatArray, weight: FloatArray) -> FloatArray:
         """Derivatives by the shared unknowns with each pair's direction following along, shape (n, p)."""
         moved = self._directions(J, Jt, weight)[1]
-        return np.asarray(J - np.einsum("ni,nik->nk", Jt, moved[self.pairs.of]))
+        return np.asarray(J - np.vecmat(Jt, moved[self.pairs.of]))
 
 
 def _products(a: FloatArray, b: FloatArray, begin: IntArray) -> FloatArray:

@@ -42,24 +42,22 @@ _CLOSE = 0.1  # a minimum this close, in steps, is reached
 
 def scaled(linear: Linear, scales: FloatArray) -> DriftProblem:
     """The problem for given noises: logs of [noise of each sensor, slow error of each, gyro drift]."""
-    S = len(linear.slow)
+    S = len(linear.slow_sizes)
     sensor_scale, slow_scale = np.exp(2.0 * scales[:S]), np.exp(2.0 * (scales[:S] + scales[S : 2 * S]))
-    drift = linear.drift * np.exp(2.0 * scales[2 * S])
+    drift = linear.drift[:, None] * np.exp(2.0 * scales[2 * S])
+    sizes, axes = slow_scale[:, None, None] * linear.slow_sizes, linear.slow_axes
     Q_inverse = np.zeros_like(linear.problem.Q_inverse)
     Q_inverse[:, [3, 4, 5], [3, 4, 5]] = 1.0 / linear.walk[:, None]
     log_determinant = 3.0 * float(np.log(linear.walk).sum())
-    if S == 1:  # the slow error joins the drift
-        Q = drift[:, None, None] * np.eye(3) + slow_scale[0] * linear.slow[0]
-        Q_inverse[:, :3, :3] = np.linalg.inv(Q)
-        log_determinant += float(np.log(np.linalg.det(Q)).sum())
+    if S == 1:
+        sizes, first = sizes + drift, 0  # the slow error joins the drift
     else:
-        Q_inverse[:, [0, 1, 2], [0, 1, 2]] = 1.0 / drift[:, None]
+        Q_inverse[:, [0, 1, 2], [0, 1, 2]], first = 1.0 / drift, 6
         log_determinant += 3.0 * float(np.log(drift).sum())
-        for i in range(S):
-            part = slice(6 + 3 * i, 9 + 3 * i)
-            Q_inverse[:, part, part] = linear.slow_inverse[i] / slow_scale[i]
-            steps = len(linear.drift)
-            log_determinant += float(linear.slow_log_determinant[i] + 3.0 * steps * np.log(slow_scale[i]))
+    for i, inverse in enumerate((axes / sizes[:, :, None]) @ np.swapaxes(axes, 2, 3)):
+        part = slice(first + 3 * i, first + 3 * i + 3)
+        Q_inverse[:, part, part] = inverse
+    log_determinant += float(np.log(sizes).sum())
     weight = linear.problem.weight / sensor_scale[linear.sensor][:, None, None]
     return replace(linear.problem, weight=weight, Q_inverse=Q_inverse, Q_log_determinant=log_determinant)
 

@@ -90,9 +90,8 @@ class Linear:
         drift: Variance per axis of the gyro's drift over each step, rad^2, shape (n - 1,).
         walk: Variance per axis of the bias over each step, (rad/s)^2, shape (n - 1,).
         middle_s: Time of each row from the middle of the data, s, shape (n,).
-        slow: Covariance of each sensor's slow error over each step per unit of scale, shape (S, n - 1, 3, 3).
-        slow_inverse: Its inverse.
-        slow_log_determinant: Its log determinant, summed over the steps, shape (S,).
+        slow_sizes: Variances of each sensor's slow error over each step per scale, shape (S, n - 1, 3).
+        slow_axes: The axes to which they belong, shape (S, n - 1, 3, 3).
     """
 
     problem: DriftProblem
@@ -102,9 +101,8 @@ class Linear:
     drift: FloatArray
     walk: FloatArray
     middle_s: FloatArray
-    slow: FloatArray
-    slow_inverse: FloatArray
-    slow_log_determinant: FloatArray
+    slow_sizes: FloatArray
+    slow_axes: FloatArray
 
 
 def linearise(
@@ -145,15 +143,13 @@ def linearise(
     drift = np.maximum(
         np.diff(curve.variance(tau, options.gyro_density)), 1e-4 * options.gyro_density**2 * _MIN_INTERVAL_S
     )
-    slow = np.empty((S, len(dt), 3, 3))
-    for i, s in enumerate(sensors):
-        A = R[:-1] @ s.R_imu_sensor
-        slow[i] = dt[:, None, None] * (A @ s.covariance.mean(axis=0) @ np.swapaxes(A, 1, 2))
+    slow_sizes, slow_axes = np.empty((S, len(dt), 3)), np.empty((S, len(dt), 3, 3))
+    for i, s in enumerate(sensors):  # its covariance, turned with the sensor
+        values, vectors = np.linalg.eigh(s.covariance.mean(axis=0))
+        slow_sizes[i], slow_axes[i] = dt[:, None] * values, R[:-1] @ (s.R_imu_sensor @ vectors)
     middle = tau - 0.5 * (tau[0] + tau[-1])
-    slow_inverse = np.asarray(np.linalg.inv(slow), dtype=np.float64)
-    determinant = np.log(np.linalg.det(slow)).sum(axis=1)
     walk = options.gyro_walk**2 * dt
-    return Linear(problem, index, order, used, drift, walk, middle, slow, slow_inverse, determinant)
+    return Linear(problem, index, order, used, drift, walk, middle, slow_sizes, slow_axes)
 
 
 def _derivatives(

@@ -9,6 +9,7 @@ sample).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -42,14 +43,14 @@ class GyroCurve:
     Attributes:
         t_s: Stamps, increasing, s, shape (m,).
         rate_rps: Bias-corrected rates in the imu frame, shape (m, 3).
-        q_ref_imu: Orientation at the samples, shape (m, 4).
+        R_ref_imu: Orientation at the samples, shape (m, 3, 3).
         integral: Integral of R_ref_imu over time, s, shape (m, 3, 3): minus the effect of a bias error.
         hole_variance: Variance per axis gathered in holes of the data up to each sample, rad^2, shape (m,).
     """
 
     t_s: FloatArray
     rate_rps: FloatArray
-    q_ref_imu: FloatArray
+    R_ref_imu: FloatArray
     integral: FloatArray
     hole_variance: FloatArray
 
@@ -69,7 +70,7 @@ class GyroCurve:
         # in a hole the rate is unknown: it may have differed from the straight line by its own usual size
         hole = np.where(dt > _GAP * np.median(dt), dt, 0.0)
         extra = np.mean(np.vecdot(rate, rate)) / 3.0 * hole**2
-        return cls(t_s, rate, so3.quat_from_matrix(R), integral, np.concatenate(([0.0], np.cumsum(extra))))
+        return cls(t_s, rate, R, integral, np.concatenate(([0.0], np.cumsum(extra))))
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -85,15 +86,19 @@ class GyroCurve:
         """Return q_ref_imu at times inside the span, shape (..., 4)."""
         k, s, slope = self._segment(times_s)
         turn = so3.quat_from_rotvec(_turn(self.rate_rps[k], slope, s))
-        return so3.quat_multiply(self.q_ref_imu[k], turn)
+        return so3.quat_multiply(self._q_ref_imu[k], turn)
+
+    @cached_property
+    def _q_ref_imu(self) -> FloatArray:
+        """Orientation at the samples, shape (m, 4)."""
+        return so3.quat_from_matrix(self.R_ref_imu)
 
     def at(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return R_ref_imu (..., 3, 3), rate in the imu frame (..., 3), integral of R_ref_imu (..., 3, 3)."""
         k, s, slope = self._segment(times_s)
-        turn = so3.quat_from_rotvec(_turn(self.rate_rps[k], slope, s))
-        R = so3.matrix_from_quat(so3.quat_multiply(self.q_ref_imu[k], turn))
+        R_k = self.R_ref_imu[k]
+        R = R_k @ so3.exp(_turn(self.rate_rps[k], slope, s))
         rate = self.rate_rps[k] + slope * s[..., None]
-        R_k = so3.matrix_from_quat(self.q_ref_imu[k])
         return R, rate, self.integral[k] + 0.5 * s[..., None, None] * (R_k + R)
 
     def matrix_effect(self, times_s: FloatArray) -> FloatArray:
@@ -104,8 +109,7 @@ class GyroCurve:
         Returns:
             shape (..., 3, 9), columns in the order of S row by row.
         """
-        R = so3.matrix_from_quat(self.q_ref_imu)
-        flow = (R[:, :, :, None] * self.rate_rps[:, None, None, :]).reshape(-1, 27)
+        flow = (self.R_ref_imu[:, :, :, None] * self.rate_rps[:, None, None, :]).reshape(-1, 27)
         total = running_integral(np.diff(self.t_s), flow)
         k, s, _ = self._segment(times_s)
         share = (s / (self.t_s[k + 1] - self.t_s[k]))[..., None]

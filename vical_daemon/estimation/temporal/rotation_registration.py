@@ -144,14 +144,14 @@ def _register(
     J[:, :, :3] = so3.matrix_from_quat(predicted)
     J[:, :, 3:6] = np.eye(3)
     J[:, :, 6:] = -R_world_ref @ integral
-    x = np.zeros(9)
+    x: FloatArray = np.zeros(9)
     weight = np.ones(len(e))
     for _ in range(4):
         r = np.linalg.norm(e - J @ x, axis=1)
         scale = max(3.0 * median(r), 1e-6)
         weight = geman_mcclure_weight((r / scale) ** 2)
-        JtW = np.swapaxes(J * weight[:, None, None], 1, 2)
-        A = np.einsum("kai,kib->ab", JtW, J)
+        JtW = (J * weight[:, None, None]).reshape(-1, 9).T
+        A = JtW @ J.reshape(-1, 9)
         A[np.arange(9), np.arange(9)] += 1e-9 * np.trace(A) / 9 + 1e-12
-        x = np.linalg.solve(A, np.einsum("kai,ki->a", JtW, e))
+        x = np.asarray(np.linalg.solve(A, JtW @ e.ravel()), np.float64)
     return x[:3], x[3:6], x[6:], weight

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp import (
     JointResult,
@@ -90,7 +89,7 @@ def _integrated(recording: Recording, name: str, base_ns: int) -> OrientationStr
         raise InputError(f"{name}: {cleaned}")
     curve = GyroCurve.integrate(*cleaned, np.zeros(3))
     step = max(1, round(1.0 / (_INTEGRATED_HZ * float(np.median(np.diff(curve.t_s))))))
-    R = so3.matrix_from_quat(curve.q_ref_imu[::step])
+    R = curve.R_ref_imu[::step]
     return OrientationStream(name, curve.t_s[::step], R, _INTEGRATED_SIGMA_RAD)
 
 
