@@ -25,7 +25,7 @@ _ENCODINGS = {
     "bayer_grbg16": ("u2", 1), "rgb16": ("u2", 3), "bgr16": ("u2", 3),
 }  # fmt: skip
 _COLOUR_ROWS = {"nv12": 0.5, "nv21": 0.5, "nv24": 2.0}
-"""Formats whose luminance comes first, as an image of its own: rows of colour after it, over its own (V4L2)."""
+"""Formats whose luminance comes first, as an image: how many rows of colour follow, over its own (V4L2)."""
 _LUMINANCE = {"yuyv": 0, "yuv422_yuy2": 0, "uyvy": 1, "yuv422": 1}
 """Formats of two bytes a pixel: which of them is its luminance (ROS 2, image_encodings.hpp)."""
 # our name of a lens model -> ROS name; radtan is plumb_bob without its fifth coefficient k3
