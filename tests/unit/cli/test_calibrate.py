@@ -285,7 +285,7 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
 def test_a_camera_too_slow_for_a_start_is_told_how_many_images_that_needs(tmp_path: Path, capsys) -> None:
     folder = write_asl(tmp_path / "slow", simulate(1, 16.0, camera_rate_hz=1.0))
     assert main(_arguments(folder)) == 1
-    assert "cam0: 9 images of the board in the latest 10 s, a start needs 15" in capsys.readouterr().err
+    assert "cam0: 10 images of the board in the latest 10 s, a start needs 15" in capsys.readouterr().err
 
 
 def test_a_failure_is_one_line_and_keeps_an_earlier_result(
