@@ -23,8 +23,6 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
             yield from _check_gx3_rate(f"imus.{name}.rate_hz", imu.rate_hz)
     for name, camera in config.cameras.items():
         yield from _check_lens(f"cameras.{name}.lens", camera, config.calibration.fix)
-    yield from _check_shared("imus", "port", {name: imu.port for name, imu in config.imus.items()})
-    yield from _check_shared("cameras", "uri", {name: camera.uri for name, camera in config.cameras.items()})
     yield from _check_bus(config.bus)
     if config.ros2 is not None and len(config.ros2_namespace) > NAMESPACE_LENGTH:
         yield "ros2.namespace", f"longer than {NAMESPACE_LENGTH} characters"
@@ -47,15 +45,6 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
         )
     if config.verify.recalibrate and config.verify.against != "store":
         yield "verify.recalibrate", "a new calibration goes to the store, so it needs `against: store`"
-
-
-def _check_shared(section: str, key: str, devices: dict[str, str]) -> Iterator[tuple[str, str]]:
-    """Each device has one reader; the sensors of a recording are told apart by their names."""
-    first: dict[str, str] = {}
-    for name, device in devices.items():
-        other = first.setdefault(device, name)
-        if other != name and device.startswith(("/", "v4l2:", "iidc:", "aravis:")):
-            yield f"{section}.{name}.{key}", f"{device} is that of {other}, too; each has a device of its own"
 
 
 def _check_bus(bus: BusConfig) -> Iterator[tuple[str, str]]:

@@ -88,8 +88,6 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [lens]}", "calibration.fix.0: the text 'lens' is none of intrinsics, timeshift, extrinsics (config line 12)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {imu: imu1}", "calibration.imu: there is no imu imu1 (known: imu0) (config line 12)"),
-        ("imus:\n", "imus:\n  b: {port: /dev/ttyUSB0}\n", "imus.imu0.port: /dev/ttyUSB0 is that of b, too; each has a device of its own (config line 5)"),
-        ("cameras:\n", "cameras:\n  b: {uri: 'v4l2:/dev/video0'}\n", "cameras.cam0.uri: v4l2:/dev/video0 is that of b, too; each has a device of its own (config line 9)"),
         ("target: board.yaml", "target: b.yaml\nbus: {commanders: [anna]}", "bus.commanders: clients cannot prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {publishers: [anna], tls_ca: ca.pem}", "bus.publishers: clients cannot prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {readers: everybody}", "bus.readers: the text 'everybody' is none of group, loopback (config line 12)"),
