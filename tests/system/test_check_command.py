@@ -62,6 +62,16 @@ def test_what_cannot_be_written_hosted_or_verified_is_found(rig, tmp_path, capsy
         assert any(part in problem for problem in problems), part
 
 
+def test_a_device_that_two_sensors_name_is_found(rig, capsys) -> None:
+    """Each is opened alone here, so both looked well."""
+    more = "cameras: {left: {uri: 'v4l2:/dev/video0'}, right: {uri: 'v4l2:/dev/video0'}}\n"
+    assert main(["check", "-c", rig("/dev/nothing", more), "--no-devices", "--json"]) == 1
+    (problem,) = json.loads(capsys.readouterr().out)["problems"]
+    assert problem == "cameras.right: v4l2:/dev/video0 is that of left, too; each needs a device of its own"
+    of_log = more.replace("v4l2:/dev/video0", "log:run.mcap")
+    assert main(["check", "-c", rig("log:run.mcap", of_log), "--no-devices"]) == 0
+
+
 def test_a_wrong_config_exits_2_with_all_of_it(rig, capsys) -> None:
     config = rig("/dev/x", "rat: 5\nweb: {prt: 1}\n")
     assert main(["check", "-c", config, "--no-devices"]) == 2

@@ -103,13 +103,14 @@ def help_text(commands: dict[str, table.Command]) -> str:
 
 
 def _dispatch(words: list[str]) -> int:
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
     selected = _selected(words)
     parser, commands = build_parser(selected)
     if selected is not None and selected not in commands:
-        raise errors.CliError(
-            f"{selected!r} is not a command{options.suggest(selected, list(commands))} (see `vical --help`)",
-            errors.EXIT_USAGE,
-        )
+        meant = table.ELSEWHERE.get(selected)
+        hint = f": {meant}" if meant else options.suggest(selected, list(commands))
+        raise errors.CliError(f"{selected!r} is not a command{hint} (see `vical --help`)", errors.EXIT_USAGE)
     args, more = parser.parse_known_args(words)
     if more:
         near = _nearest_option(parser, selected, more[0])

@@ -92,6 +92,8 @@ def examine(config: Config, name: str, *, devices: bool) -> Iterator[Finding]:
     yield _check_disk(config)
     yield from _check_store(config)
     yield from _check_bus(config)
+    yield from _check_shared("imus", {name: imu.port for name, imu in config.imus.items()})
+    yield from _check_shared("cameras", {name: camera.uri for name, camera in config.cameras.items()})
     if not devices:
         return
     from vical_daemon.acquire.camera import open_camera
@@ -172,6 +174,17 @@ def _check_store(config: Config) -> Iterator[Finding]:
         yield Finding("verify.against", str(config.verify_path), str(error))
         return
     yield Finding("verify.against", f"{config.verify_path}: {', '.join(known)}")
+
+
+def _check_shared(section: str, devices: dict[str, str]) -> Iterator[Finding]:
+    """Each device has one reader. The sensors of a recording are told apart by their names."""
+    first: dict[str, str] = {}
+    for name, device in devices.items():
+        other = first.setdefault(device, name)
+        if other != name and device.startswith(("/", "v4l2:", "iidc:", "aravis:")):
+            place = f"{section}.{name}"
+            text = f"{place}: {device} is that of {other}, too; each needs a device of its own"
+            yield Finding(place, device, text)
 
 
 def _check_bus(config: Config) -> Iterator[Finding]:

@@ -100,6 +100,13 @@ def _matrix(args: argparse.Namespace) -> int:
     for i in range(len(args.sources) - 1):
         cells = [_cell(found[i, j]) if j > i else "" for j in range(1, len(args.sources))]
         print(f"{i + 1:>5}" + "".join(f"{cell:>20}" for cell in cells))
+    print()
+    notes: dict[str, list[str]] = {}
+    for (i, j), comparison in found.items():
+        for note in comparison.notes:
+            notes.setdefault(note, []).append(f"{i + 1}-{j + 1}")
+    for note, where in notes.items():
+        print(f"note ({', '.join(where)}): {note}")
     return _code(list(found.values()))
 
 

@@ -80,6 +80,17 @@ COMMANDS = (
 )
 
 
+ELSEWHERE = {
+    "list": "`vical devices` lists IMUs and cameras",
+    "record": "`vical run -c FILE` records (`record` in the config); start, stop: `vical command`",
+    "start": "`vical run -c FILE`, or for the service: systemctl start vical.target",
+    "stop": "^C ends `vical run`; the service: systemctl stop vical.target",
+    "status": "`vical watch` shows the calibration live; the service: systemctl status 'vical-*'",
+    "version": "`vical --version`",
+}
+"""Words that other programs have as commands, and what serves here."""
+
+
 def available() -> dict[str, Command]:
     """Return the commands whose module exists, by name, in the order of the table."""
     return {command.name: command for command in COMMANDS if command.present}

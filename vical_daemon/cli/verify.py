@@ -118,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
     run_job(job, bar.show, enough=verifier.look)
     bar.close()
     document = verifier.document()
+    paired = len(known) == 1 or args.camera  # then it is meant
+    document["not_checked"] = [] if paired else [name for name in known if name not in verifier.cameras]
     if args.json:
         print(json.dumps(finite(document), allow_nan=False))
     else:

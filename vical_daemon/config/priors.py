@@ -72,6 +72,8 @@ class _KalibrImu:
     time_offset: float | None = None
 
 
+_OTHER_LENSES = ("omni", "eucm", "ds")
+"""Camera models of Kalibr that we lack."""
 _RESULTS_OF_IMU = (
     *("Tw", "Ta", "Tg", "R_IMUtoGYRO", "R_IMUtoACC", "R_GYROtoIMU", "R_ACCtoIMU"),  # OpenVINS
     *("accelerometers", "gyroscopes"),  # Kalibr
@@ -130,6 +132,7 @@ def priors_in(document: Document) -> Initial:
         if name in loose:
             continue
         if name.startswith("cam"):
+            _refuse_other_lenses(document, name)
             camera = schema.build(document, _KalibrCamera, name)
             cameras[name] = _camera_prior(document, name, camera)
             if camera.T_cn_cnm1:
@@ -181,6 +184,17 @@ def calibration_options(config: Config) -> CalibrationOptions:
             wanted.position_sigma_m, math.radians(wanted.rotation_sigma_deg), wanted.timeshift_sigma_s
         ),
     )
+
+
+def _refuse_other_lenses(document: Document, name: str) -> None:
+    section = document.root[name]
+    model = section.get("camera_model") if isinstance(section, dict) else None
+    if model in _OTHER_LENSES:
+        text = (
+            f"{model} lenses are not supported, only pinhole with radtan or equidistant distortion: "
+            "calibrate as pinhole-equi, or for --initial leave camera_model, intrinsics and distortion out"
+        )
+        raise ConfigError(schema.mistake(document, f"{name}.camera_model", text))
 
 
 def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> CameraPrior:

@@ -105,7 +105,10 @@ def _rows(path: Path) -> tuple[list[str], list[tuple[int, str]], list[str]]:
     """Lines in front of the first row of numbers, rows with their line numbers, and a list for warnings."""
     titles: list[str] = []
     rows: list[tuple[int, str]] = []
-    text = read_file(path, TABLE_LIMIT).decode("utf-8-sig", "replace")
+    data = read_file(path, TABLE_LIMIT)
+    if b"\0" in data:
+        raise RecordingError(f"{path}: no text, so no trajectory; expected {_EXPECTED}")
+    text = data.decode("utf-8-sig", "replace")
     for number, line in enumerate(text.splitlines(), 1):
         text = line.strip()
         if not text:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from vical_daemon.bus import topics
 from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
 from vical_daemon.config.priors import Initial
@@ -13,6 +15,8 @@ from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.errors import InputError, OptionError, size_unknown
+
+_COPIED = 0.05  # share of the readings; where a log was split, a few may be in both files
 
 
 @dataclass(slots=True)
@@ -155,7 +159,26 @@ def add_recordings(job: Job, recordings: Sequence[Recording], imu: str | None = 
                 raise InputError(f"{recording.path}: {name} has images of {found}, those before of {given}")
         imu_stream = _choose("imu", recording.imus, imu)
         part = Job(recording, imu_stream, cameras, job.config, job.priors, job.skip_s, job.seconds)
+        for earlier in job.parts:
+            _check_own_readings(part, earlier)
         job.others.append(part)
+
+
+def _check_own_readings(part: Job, earlier: Job) -> None:
+    """Refuse a copy: the same data used twice make sigmas too small, and agree with themselves.
+
+    Recordings whose stamps begin at 0 may have stamps in common, but not readings.
+    """
+    if part.imu.begin_ns > earlier.imu.end_ns or earlier.imu.begin_ns > part.imu.end_ns:
+        return
+    one, other = (job.recording.imu_arrays(job.imu.name) for job in (part, earlier))
+    _, at, there = np.intersect1d(one.t_ns, other.t_ns, return_indices=True)
+    same = np.count_nonzero((one.gyro_rps[at] == other.gyro_rps[there]).all(axis=1))
+    if same > _COPIED * len(one.t_ns):
+        raise OptionError(
+            f"{part.recording.path}: {same} of its {len(one.t_ns)} IMU readings are those of "
+            f"{earlier.recording.path}; give data once"
+        )
 
 
 def _same_cameras(job: Job, recording: Recording) -> dict[str, Stream]:

@@ -91,10 +91,11 @@ class Verifier:
             check.why = str(error)
             return
         check.odds, check.why = weighed, ""
-        if not weighed.undecided:
-            check.answer = Answer.HOLDS
-        elif weighed.log_changed > math.log(len(self.cameras) / FALSE_ALARM):
+        sure = weighed.log_changed > math.log(len(self.cameras) / FALSE_ALARM)
+        if sure and (weighed.undecided or _another_lens(check.stored, weighed, self.counts)):
             check.answer = Answer.CHANGED
+        elif not weighed.undecided:
+            check.answer = Answer.HOLDS
 
     def _odds(self, check: CameraCheck, found: KnownCamera, seconds: float) -> Odds:
         apart = difference(check.stored, found)
@@ -149,16 +150,30 @@ def _camera_document(name: str, check: CameraCheck, counts: Counts) -> dict[str,
             {"camera": name} | _change(block, check.stored, weighed) for block in weighed.blocks
         ]
     smallest = _smallest(counts)
+    moved = weighed.blocks if check.answer is Answer.CHANGED else ()
     for block in weighed.log_holds:
         unit = smallest[block]
         out["blocks"][block] = {
-            "holds": block not in weighed.undecided,
+            "holds": block not in weighed.undecided and block not in moved,
             "counts_from": unit * max(1.0, weighed.floor[block]),
             "visible_from": unit * weighed.visible[block],
             "left_open_by_stored": unit * weighed.floor[block],
             "unit": "of the focal length" if block == "lens" else UNITS[block],
         }
     return out
+
+
+def _another_lens(stored: KnownCamera, weighed: Odds, counts: Counts) -> bool:
+    """Whether a lens projects points as far from where it did as if it were focused by what counts.
+
+    Changes of its distortion alone are none of those that `log_holds` rules out.
+    """
+    if "lens" not in weighed.blocks or stored.lens is None:
+        return False
+    moved = weighed.moved[BLOCKS["lens"]]
+    P, focused = np.zeros((len(moved), len(moved))), np.zeros(len(moved))
+    focused[:2] = counts.lens_share * stored.lens[:2]
+    return lens_displacement_px(stored, moved, P)[0] > lens_displacement_px(stored, focused, P)[0]
 
 
 def _smallest(counts: Counts) -> dict[str, float]:

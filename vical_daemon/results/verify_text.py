@@ -20,6 +20,8 @@ def describe(document: dict[str, Any], against: str) -> str:
         lines += [f"  {change_text(change)}" for change in camera["changes"]]
         lines += [f"  {_block(block, row)}" for block, row in camera["blocks"].items()]
         lines += [f"  note: {note}" for note in camera["assumed"]]
+    for name in document.get("not_checked", []):
+        lines += ["", f"{name}: not checked, this recording does not have it"]
     if document["missing_motion"]:
         lines += ["", *(f"what would help: {text}" for text in document["missing_motion"])]
     return "\n".join(lines)

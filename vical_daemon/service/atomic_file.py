@@ -8,12 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def atomic_write(path: Path, data: bytes) -> None:
+def atomic_write(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Write a file atomically: a reader finds the old or the new content, never a part of it.
 
     Args:
         path: The file; its folder is created if missing.
         data: The new content.
+        durable: Wait until it is on the disk. False: for what is of no use after a power cut.
 
     Raises:
         OSError: The write failed; the old content is kept and no temporary file is left.
@@ -25,11 +26,14 @@ def atomic_write(path: Path, data: bytes) -> None:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from None  # `write` does not name the file
+    if not durable:
+        return
     folder = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(folder)

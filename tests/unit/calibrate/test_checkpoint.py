@@ -103,6 +103,22 @@ def test_it_goes_on_where_it_was(
     assert a.to_json() == b.to_json()
 
 
+def test_it_is_small(tmp_path: Path, config: Config, converged: Calibrator) -> None:
+    """It had 8 MB, nearly all of them copies of the filter of the last seconds."""
+    assert len(pickle.dumps(converged)) > 4e6
+    Checkpoint(tmp_path, config, CLOCK).save(converged, DEVICES)
+    assert (tmp_path / FILE_NAME).stat().st_size < 4e5
+    assert len(pickle.dumps(converged)) > 4e6  # the running one has all it needs
+
+
+def test_no_save_waits_for_the_disk(
+    tmp_path: Path, config: Config, converged: Calibrator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda _: pytest.fail("the estimator waits; it may be for seconds"))
+    Checkpoint(tmp_path, config, CLOCK).save(converged, DEVICES)
+    assert Checkpoint(tmp_path, config, CLOCK).load(DEVICES) is not None
+
+
 def test_stamps_on_arrival_are_kept(tmp_path: Path, config: Config, converged: Calibrator) -> None:
     late_ns = np.random.default_rng(1).exponential(4e6, 120).astype(np.int64)
     known = {"cam0": (10**18 + 50_000_000 * np.arange(120) + late_ns).tolist()}

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vical_mocks.harness.asl import write_asl
+from vical_mocks.points import simulate
 
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
 from vical_daemon.cli import calibration_text, main
@@ -278,6 +280,12 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     out, err = capsys.readouterr()
     assert out == "" and "Traceback" not in err
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
+
+
+def test_a_camera_too_slow_for_a_start_is_told_how_many_images_that_needs(tmp_path: Path, capsys) -> None:
+    folder = write_asl(tmp_path / "slow", simulate(1, 16.0, camera_rate_hz=1.0))
+    assert main(_arguments(folder)) == 1
+    assert "cam0: 10 images of the board in the latest 10 s, a start needs 15" in capsys.readouterr().err
 
 
 def test_a_failure_is_one_line_and_keeps_an_earlier_result(

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vical_mocks.harness.asl import write_asl
+from vical_mocks.points import simulate
 
 from vical_daemon.cli import main
 from vical_daemon.results.export import export
@@ -114,6 +116,9 @@ def test_compare_matrix_of_three(write, capsys):
     assert code == 4
     assert out.count("same") == 1
     assert out.count("changed") == 2
+    foreign = write("chain.yaml", 0.0, "kalibr")
+    _, out, _ = run(capsys, "compare", files[0], foreign, files[1], "--matrix")
+    assert "note (1-2, 2-3): chain.yaml: no sigma given, assumed: position 1 mm" in out
     code, out, _ = run(capsys, "compare", *files, "--matrix", "--json")
     assert [pair["verdict"] for pair in json.loads(out)["pairs"]] == ["same", "changed", "changed"]
 
@@ -155,6 +160,29 @@ def test_mistakes_are_one_line(capsys, args, code, line):
     assert found == code
     assert line in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_verify_says_which_cameras_it_did_not_check(write, rig, tmp_path, capsys):
+    """A recording of one camera of two said that both hold."""
+    folder = write_asl(tmp_path / "day", simulate(3, 6.0, camera_rate_hz=10.0))
+    truth = simulate(3, 0.2).rig
+    camera = replace(
+        rig.cameras["cam0"],
+        R_imu_cam=truth.R_imu_cam,
+        p_imu_cam=np.asarray(truth.p_imu_cam),
+        timeshift_cam_imu_s=truth.timeshift_cam_imu_s,
+        intrinsics=tuple(truth.lens.intrinsics),
+        distortion_model=truth.lens.model,
+        distortion=tuple(truth.lens.distortion),
+        resolution=(640, 480),
+    )
+    both = tmp_path / "both.yaml"
+    both.write_text(export(replace(rig, cameras={"cam0": camera, "cam1": camera}), "kalibr")[0].text)
+    asked = ["verify", str(folder), "--against", str(both), "--target", str(folder / "target.yaml")]
+    _, out, _ = run(capsys, *asked)
+    assert "\ncam1: not checked, this recording does not have it" in out
+    assert json.loads(run(capsys, *asked, "--json")[1])["not_checked"] == ["cam1"]
+    assert json.loads(run(capsys, *asked, "--json", "--camera", "cam0")[1])["not_checked"] == []
 
 
 @needs_euroc

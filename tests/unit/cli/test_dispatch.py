@@ -79,6 +79,25 @@ def test_unknown_command_names_the_nearest(command, capsys: pytest.CaptureFixtur
     assert "did you mean probe?" in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize("word", table.ELSEWHERE)
+def test_words_of_other_programs_lead_to_ours(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """`vical start` was asked whether it meant target."""
+    assert cli.main([word]) == 2
+    err = capsys.readouterr().err
+    assert f"vical: error: '{word}' is not a command: {table.ELSEWHERE[word]}" in err
+    for named in re.findall(r"`vical (\w+)", err):
+        assert named in table.available()
+
+
+def test_help_is_a_command_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["help"]) == 0
+    assert "First steps:" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        cli.main(["help", "target"])
+    assert left.value.code == 0
+    assert "usage: vical target" in capsys.readouterr().out
+
+
 def test_every_leaf_takes_json_even_if_the_module_forgot(command) -> None:
     def nested(parser: argparse.ArgumentParser) -> None:
         subparsers = parser.add_subparsers(dest="what", required=True)

@@ -304,7 +304,11 @@ class TestInitial:
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5; the model with these is plumb_bob",
             ),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
-            ("cam0: {camera_model: omni}", "is not pinhole"),
+            ("cam0: {camera_model: fisheye}", "is not pinhole"),
+            (
+                "cam0: {camera_model: omni, intrinsics: [1.2, 500, 500, 320, 240]}",
+                "calibrate as pinhole-equi",
+            ),
             ("camera: {}\nlidar0: {}", "unknown section"),
             ("cam0: 5", "unknown key"),
             ("imu0: {gyroscope_noise_density: -1}", "must be above 0"),

@@ -122,6 +122,14 @@ def test_a_bad_line_in_the_middle_is_named(tmp_path, line, says):
         read_trajectory(path)
 
 
+def test_a_recording_is_no_trajectory(tmp_path):
+    """A line of binary data was quoted."""
+    path = tmp_path / "log.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n\x01\x13\x00\x00\n32 \x0bresync_bytes\x00\n")
+    with pytest.raises(RecordingError, match="no text, so no trajectory; expected `t x y z"):
+        read_trajectory(path)
+
+
 def test_titles_that_do_not_fit_the_rows_are_refused(tmp_path):
     two = "t,a,b,c,q_cam_w,q_cam_x,q_cam_y,q_cam_z,q_imu_w,q_imu_x,q_imu_y,q_imu_z\n"
     path = write(tmp_path / "a.csv", [seconds(t) for t in STAMPS_NS], W_LAST, ",", two)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +90,20 @@ def test_of_two_that_disagree_nothing_is_merged(folders, capsys, tmp_path, monke
     assert result["status"] == "inconsistent" and result["cameras"] == {}
     assert result["disagreeing"]
     assert "too few to tell" in err and not (tmp_path / "r.json").exists()
+
+
+def test_a_copy_of_a_recording_is_no_other_recording(folders, capsys, tmp_path) -> None:
+    """It agreed with itself, and made sigmas smaller by a root of two."""
+    copy = shutil.copytree(folders["monday"], tmp_path / "copy")
+    code, _, err = _merge(capsys, folders | {"copy": copy}, "monday", "tuesday", "copy")
+    assert code == 2 and err.count("\n") == 1
+    assert f"{copy}: 601 of its 601 IMU readings are those of {folders['monday']}; give data once" in err
+
+
+def test_other_recordings_with_the_same_stamps_are_merged(folders, capsys, tmp_path) -> None:
+    """Simulators begin at zero."""
+    again = write_asl(tmp_path / "again", simulate(77, 6.0, rig=reference_rig(77), camera_rate_hz=10.0), 0.0)
+    assert _merge(capsys, folders | {"again": again}, "monday", "again")[0] in (0, 3)
 
 
 def _nothing() -> CalibrationEstimate:

@@ -92,6 +92,19 @@ def test_a_changed_lens_is_told_in_pixels_over_the_image(stored):
     assert change["unit"] == "px"
 
 
+@pytest.mark.parametrize(("k1", "verdict"), [(0.28, "changed"), (0.05, "changed"), (0.004, "holds")])
+def test_a_lens_whose_distortion_alone_is_wrong_is_another_lens(stored, k1, verdict):
+    """It was `holds` with a probability of a change of 1: a file whose distortion is `none`."""
+    e = np.zeros(15)
+    e[11] = k1  # 0.004: significant, and less than counts
+    verifier = Verifier({"cam0": CameraCheck(stored, lens_asked=True)})
+    assert verifier.look(estimate(e))
+    document = verifier.document()
+    assert document["verdict"] == verdict
+    assert [change["what"] for change in document["changes"]] == ["lens"] * (verdict == "changed")
+    assert document["cameras"]["cam0"]["blocks"]["lens"]["holds"] == (verdict == "holds")
+
+
 def test_poor_motion_cannot_tell_and_names_what_is_missing(stored):
     verifier = Verifier({"cam0": CameraCheck(stored, lens_asked=True)})
     assert not verifier.look(estimate(times=40.0))

@@ -13,6 +13,7 @@ import pytest
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import (
+    CalibrationMessage,
     Change,
     CheckState,
     DiagnosticStatus,
@@ -90,6 +91,19 @@ def test_history_is_thinned_towards_the_past(bus, state, web_feed):
     assert times == sorted(times)
     assert times[0] < 1.0
     assert times[-1] - times[-2] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_the_history_of_an_hour_has_no_hole(bus, state, web_feed):
+    """Between the first row and the last 15 minutes there was none: charts showed a straight line."""
+    message = web_feed.estimate(0.2, np.random.default_rng(3))
+    for k in range(1, 5 * 3600):
+        t_s = 0.2 * k
+        state._calibration(CalibrationMessage("cam0", replace(message, duration_s=t_s)), t_s)
+        state._cameras["cam0"].fresh.clear()
+    times = np.array([row[0] for row in state.full()["cameras"]["cam0"]["rows"]])
+    assert times[0] == 0.2 and times[-1] == t_s and len(times) <= HISTORY
+    assert np.diff(times).max() < 15.0  # the older half has 750 rows
+    assert np.diff(times[-750:]).max() < 0.21
 
 
 def test_a_restarted_estimator_begins_a_new_history(bus, state, web_feed):

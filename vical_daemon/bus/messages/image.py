@@ -18,11 +18,14 @@ CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 # ROS name of the pixel format -> (numpy type, channels)
 _ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
-    "bgr8": ("u1", 3), "rgb8": ("u1", 3), "8UC3": ("u1", 3), "bgra8": ("u1", 4), "rgba8": ("u1", 4),
+    "bgr8": ("u1", 3), "rgb8": ("u1", 3), "8UC3": ("u1", 3),
+    "bgra8": ("u1", 4), "rgba8": ("u1", 4), "8UC4": ("u1", 4),
     "bayer_rggb8": ("u1", 1), "bayer_bggr8": ("u1", 1), "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
     "bayer_rggb16": ("u2", 1), "bayer_bggr16": ("u2", 1), "bayer_gbrg16": ("u2", 1),
     "bayer_grbg16": ("u2", 1), "rgb16": ("u2", 3), "bgr16": ("u2", 3),
 }  # fmt: skip
+_COLOUR_ROWS = {"nv12": 0.5, "nv21": 0.5, "nv24": 2.0}
+"""Formats whose luminance comes first, as an image: how many rows of colour follow, over its own (V4L2)."""
 _LUMINANCE = {"yuyv": 0, "yuv422_yuy2": 0, "uyvy": 1, "yuv422": 1}
 """Formats of two bytes a pixel: which of them is its luminance (ROS 2, image_encodings.hpp)."""
 # our name of a lens model -> ROS name; radtan is plumb_bob without its fifth coefficient k3
@@ -42,7 +45,7 @@ class ImageMessage:
         encoding: ROS name of the pixel format, e.g. mono8.
         big_endian: Byte order of 16-bit pixels.
         step: Bytes from one row to the next.
-        data: The rows, `height * step` bytes; a view of the message.
+        data: The rows, `height * step` bytes (of NV12 those of luminance); a view of the message.
     """
 
     stamp_ns: int
@@ -57,7 +60,7 @@ class ImageMessage:
     def pixels(self) -> npt.NDArray[Any]:
         """Return the image, shape (height, width) or (height, width, channels); a read-only view.
 
-        Of YUV 4:2:2 it is the luminance, and 16-bit pixels have the byte order of this computer; those are
+        Of YUV it is the luminance, and 16-bit pixels have the byte order of this computer; those are
         copies.
 
         Raises:
@@ -66,9 +69,10 @@ class ImageMessage:
         if self.encoding in _LUMINANCE and self.step >= 2 * self.width:
             rows = np.frombuffer(self.data, np.uint8).reshape(self.height, self.step)
             return np.ascontiguousarray(rows[:, _LUMINANCE[self.encoding] : 2 * self.width : 2])
-        if self.encoding not in _ENCODINGS:
+        encoding = "mono8" if self.encoding in _COLOUR_ROWS else self.encoding
+        if encoding not in _ENCODINGS:
             raise MessageError(f"pixel format {self.encoding!r} is not supported; use mono8, mono16 or bgr8")
-        code, channels = _ENCODINGS[self.encoding]
+        code, channels = _ENCODINGS[encoding]
         dtype = np.dtype((">" if self.big_endian else "<") + code)
         if self.step < self.width * channels * dtype.itemsize or self.step % dtype.itemsize:
             raise MessageError(
@@ -155,9 +159,13 @@ def decode_image(data: bytes) -> ImageMessage:
     encoding, big_endian, step = reader.string(), bool(reader.scalar("B")), reader.scalar("I")
     pixels = reader.blob()
     reader.end()
-    if not height or not width or len(pixels) != height * step:
+    size = height * step
+    if encoding in _COLOUR_ROWS and len(pixels) == round(size * (1.0 + _COLOUR_ROWS[encoding])):
+        pixels = pixels[:size]
+    if not height or not width or len(pixels) != size:
         raise MessageError(
-            f"image of {width} x {height} with rows of {step} bytes but {len(pixels)} bytes of data"
+            f"{encoding} image of {width} x {height} with rows of {step} bytes "
+            f"but {len(pixels)} bytes of data"
         )
     return ImageMessage(stamp_ns, frame_id, width, height, encoding, big_endian, step, pixels)
 

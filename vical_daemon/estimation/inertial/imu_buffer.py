@@ -22,6 +22,7 @@ GAP_S = 0.05
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
 _HALF_BLOCK_S = 2.5e-3  # of `BlockMeans`
+_ROOM = 4096  # readings for which there is room at first
 _USUAL = 201  # samples whose median interval is the usual one
 
 
@@ -57,13 +58,20 @@ class ImuBuffer:
 
     def __init__(self, base_ns: int) -> None:
         self.base_ns = base_ns
-        self._rows = np.empty((4096, 7))
+        self._rows = np.empty((_ROOM, 7))
         self._start = 0
         self._stop = 0
         self._clipping_sigma: FloatArray | None = None  # of each row; None: no reading was clipped
 
     def __len__(self) -> int:
         return self._stop - self._start
+
+    def __getstate__(self) -> dict[str, object]:
+        """A copy, or a saved estimator, holds the readings without the room around them."""
+        live = slice(self._start, self._stop)
+        sigma = None if self._clipping_sigma is None else self._clipping_sigma[live].copy()
+        rows = {"_rows": self.rows.copy(), "_start": 0, "_stop": len(self), "_clipping_sigma": sigma}
+        return self.__dict__ | rows
 
     @property
     def rows(self) -> FloatArray:
@@ -137,7 +145,7 @@ class ImuBuffer:
             self._stop -= 1
 
     def _make_room(self) -> None:
-        length = len(self._rows) * (2 if len(self) > len(self._rows) // 2 else 1)
+        length = max(_ROOM, len(self._rows) * (2 if len(self) > len(self._rows) // 2 else 1))
         live = slice(self._start, self._stop)
         self._rows = _moved(self._rows, live, length)
         if self._clipping_sigma is not None:

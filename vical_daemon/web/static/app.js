@@ -2,9 +2,11 @@
 // Listens to /events and draws. Everything from the robot goes in as text, never as HTML.
 
 const $ = (id) => document.getElementById(id);
-const page = { columns: [], rows: {}, latest: {}, devices: [], sights: {}, paths: {}, views: [], fault: null, control: false, camera: null, span: 0, heard: 0 };
+const page = { columns: [], rows: {}, latest: {}, devices: [], sights: {}, paths: {}, views: [], fault: null, control: false, camera: null, span: 0, heard: 0, heardAt: 0, asked: 0 };
 const SILENT_MS = 5000; // the robot speaks 2.5 times a second
+const DEAD_MS = 10000; // of silence: nobody tells a phone that slept or changed its network that a connection is gone
 const AGAIN_MS = 3000;
+const ROWS = 2000; // kept of a camera; a chart has about 500 pixels
 const AXES = ["x", "y", "z"];
 const COLOURS = ["--x", "--y", "--z"];
 
@@ -254,7 +256,7 @@ function draw() {
   drawTabs();
   drawWords();
   drawDevices();
-  drawCharts();
+  if (!document.hidden) drawCharts(); // nine tenths of the work
   drawSight();
 }
 
@@ -269,10 +271,19 @@ function watchSilence() {
       reason: `The values are old; the last status was ${latest.last_status}.` });
   }
   drawWords();
+  if (Math.min(silent, performance.now() - page.asked) > DEAD_MS) connectAnew();
+}
+
+function thinned(rows) { // as in web/state.py
+  const gaps = [];
+  for (let i = 1; i < rows.length >> 1; i += 2) gaps.push([rows[i + 1][0] - rows[i - 1][0], i]);
+  const gone = new Set(gaps.sort((a, b) => a[0] - b[0]).slice(0, gaps.length >> 1).map(([, i]) => i));
+  return rows.filter((_, i) => !gone.has(i));
 }
 
 function take(message, full) {
   page.heard = performance.now();
+  page.heardAt = Date.now();
   setText("rig", message.rig);
   document.title = `vical ${message.rig}`;
   if (full) {
@@ -285,7 +296,7 @@ function take(message, full) {
   }
   for (const [name, camera] of Object.entries(message.cameras)) {
     page.rows[name] = camera.rows || (page.rows[name] || []).concat(camera.fresh);
-    if (page.rows[name].length > 4000) page.rows[name] = page.rows[name].filter((_, i) => i % 2 || i > 2000);
+    if (page.rows[name].length > ROWS) page.rows[name] = thinned(page.rows[name]);
     page.latest[name] = camera;
   }
   page.devices = message.devices;
@@ -295,6 +306,7 @@ function take(message, full) {
 }
 
 function listen() {
+  page.asked = performance.now();
   const source = page.source = new EventSource("events");
   source.addEventListener("full", (event) => take(JSON.parse(event.data), true));
   source.addEventListener("update", (event) => take(JSON.parse(event.data), false));
@@ -309,6 +321,21 @@ function listen() {
 function again(source, connect) {
   if (source.readyState === EventSource.CLOSED) setTimeout(connect, AGAIN_MS);
 }
+
+function connectAnew() {
+  page.source?.close();
+  $("link").classList.remove("on");
+  setText("link", "offline, trying again");
+  listen();
+  if (camera.name !== null) camera.connect();
+}
+
+// A clock of the page may stand still while a phone sleeps; the wall clock does not.
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden || !page.heard) return;
+  if (Date.now() - page.heardAt > SILENT_MS) connectAnew();
+  drawCharts();
+});
 
 // A page that the browser keeps for its back button would keep its connections, of which there are six a host.
 window.addEventListener("pagehide", () => { page.source?.close(); camera.source?.close(); });

@@ -133,6 +133,28 @@ def test_of_yuv_the_luminance_is_used(encoding: str, first: int) -> None:
         replace(message, width=9).pixels()
 
 
+@pytest.mark.parametrize(("encoding", "colour_rows"), [("nv12", 3), ("nv21", 3), ("nv24", 12)])
+def test_of_planar_yuv_the_luminance_is_used(encoding: str, colour_rows: int) -> None:
+    """As drivers of the Raspberry Pi's cameras send it."""
+    whole = np.arange((6 + colour_rows) * 8, dtype=np.uint8).reshape(-1, 8)
+    stamp = ros("builtin_interfaces/msg/Time", sec=1, nanosec=0)
+    message = ros(
+        m.IMAGE_TYPE,
+        header=ros("std_msgs/msg/Header", stamp=stamp, frame_id="cam0"),
+        height=6,
+        width=8,
+        encoding=encoding,
+        is_bigendian=0,
+        step=8,
+        data=whole.reshape(-1),
+    )
+    decoded = m.decode_image(serialised(message, m.IMAGE_TYPE))
+    np.testing.assert_array_equal(decoded.pixels(), whole[:6])
+    message.data = message.data[:-1]
+    with pytest.raises(m.MessageError, match=f"{encoding} image of 8 x 6 .* bytes of data"):
+        m.decode_image(serialised(message, m.IMAGE_TYPE))
+
+
 def test_image_that_contradicts_itself_is_refused():
     image = np.zeros((4, 6), np.uint8)
     with pytest.raises(m.MessageError, match="cannot be sent"):

@@ -1,5 +1,6 @@
 """The inertial buffer: exact ends, holes, and bounded memory."""
 
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -161,3 +162,22 @@ def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
     assert np.abs(rate[0] - [0.02 * np.sin(w * 1e-3) * 0.0, 0.3, 0.0]).max() < 2e-3  # at the first reading
     slow = filled()
     assert np.abs(slow.turning(np.array([0.7, 2.0]), 0.01)[0] - rates([0.7, 2.0])).max() < 1e-3
+
+
+@pytest.mark.parametrize("readings", [0, 500])
+@pytest.mark.parametrize("clipped", [False, True])
+def test_a_saved_buffer_holds_its_readings_alone_and_goes_on(readings: int, clipped: bool) -> None:
+    buffer = filled(readings)
+    buffer.trim(2.0)
+    if clipped:
+        buffer.append(5.0, rates(5.0), forces(5.0), [0.1] * 6)
+    saved = pickle.dumps(buffer)
+    assert len(saved) < 1000 + 110 * len(buffer)  # 13 numbers a reading
+    again = pickle.loads(saved)
+    assert np.array_equal(again.rows, buffer.rows)
+    for k in range(600):
+        for each in (buffer, again):
+            assert each.append(5.01 + 0.01 * k, rates(k), forces(k), [0.2] * 6 if clipped else None)
+    a, b = (each.segment(5.1, 10.9) for each in (buffer, again))
+    assert np.array_equal(a.gyro, b.gyro) and np.array_equal(a.accel_slope, b.accel_slope)
+    assert (a.clipping_sigma is not None) == clipped and np.array_equal(a.clipping_sigma, b.clipping_sigma)
