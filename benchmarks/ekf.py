@@ -25,6 +25,7 @@ from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.next_term import reported_camera
 
 FloatArray = npt.NDArray[np.float64]
 # attitude, position, velocity, gyro bias, accelerometer bias, gravity; lever arm, mounting, shift, lens
@@ -177,14 +178,15 @@ class EkfSubject:
 
     def _start(self, product: CalibrationFilter) -> None:
         state, sigmas = product.state, product.sigmas()
-        camera, where = state.cameras[CAMERA], product.layout.cameras[CAMERA]
+        # without the term that the product's lens has beyond radtan
+        camera, where = reported_camera(state.cameras[CAMERA], np.eye(8, 9)), product.layout.cameras[CAMERA]
         s = np.zeros(SIZE)
         s[THETA], s[P], s[V], s[BG], s[BA] = (sigmas[3 * i : 3 * i + 3] for i in range(5))
         s[G] = 0.1 * self.options.gravity_mps2
         assert where.timeshift is not None
         s[LEVER], s[MOUNT], s[SHIFT] = sigmas[where.position], sigmas[where.rotation], sigmas[where.timeshift]
         if where.intrinsics is not None and where.distortion is not None:
-            s[INTRINSICS], s[DISTORTION] = sigmas[where.intrinsics], sigmas[where.distortion]
+            s[INTRINSICS], s[DISTORTION] = sigmas[where.intrinsics], sigmas[where.distortion][:4]
         lens = Lens(
             tuple(camera.intrinsics.tolist()),
             tuple(camera.distortion.tolist()),

@@ -1,6 +1,7 @@
 """The comparator has to be a fair one: started close to the truth a plain EKF reaches the bound."""
 
 import numpy as np
+import pytest
 from vical_mocks.cramer_rao.bound import bounds
 from vical_mocks.cramer_rao.information import BoundOptions
 from vical_mocks.harness.feed import StartErrors, camera_prior, feed, imu_noise
@@ -77,10 +78,12 @@ def test_a_plain_ekf_reaches_the_bound_from_close_by():
     assert np.all(claimed / least < 1.15)
 
 
-def test_the_comparator_begins_where_the_product_does():
+@pytest.mark.parametrize("known", [True, False])
+def test_the_comparator_begins_where_the_product_does(known):
     run = simulate(6, 8.0, rig=reference_rig(6, timeshift_cam_imu_s=-0.02))
-    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=imu_noise(run))
-    prior = camera_prior(run, 6, StartErrors(), exact_lens=True)
+    fix = frozenset({"intrinsics"}) if known else frozenset()
+    options = CalibrationOptions(fix=fix, imu_noise=imu_noise(run))
+    prior = camera_prior(run, 6, StartErrors(), exact_lens=known)
     record = feed(run, EkfSubject(options, prior, run.points_m))
     assert record.started_s() < 7.0
     last = record.snapshots[-1]
