@@ -110,6 +110,7 @@ def step(by_s: float, t_s: float) -> float:
     return by_s if t_s >= AT_S else 0.0
 
 
+MOVED = "bump of 10 mm in a gap of 10 s"
 CASES: dict[str, tuple[Change, float]] = {
     **{
         f"{sensors} {seconds:g} s": (partial(cut, sensors, seconds), seconds)
@@ -124,6 +125,7 @@ CASES: dict[str, tuple[Change, float]] = {
         for step_s in STEPS_S
     },
     "bump in a gap of 5 s": (partial(cut, "both", 5.0), 5.0),
+    MOVED: (partial(cut, "both", 10.0), 10.0),
 }
 UNDISTURBED = "undisturbed"
 CASES[UNDISTURBED] = (lambda run: run, 0.0)
@@ -131,7 +133,7 @@ CASES[UNDISTURBED] = (lambda run: run, 0.0)
 
 @lru_cache(maxsize=4)
 def simulated(case: str, seed: int, *, target_free: bool) -> SimulatedRun:
-    """The undisturbed recording; a bump of 2 deg and 10 mm where the case asks for one.
+    """The undisturbed recording; a bump of 2 deg and 10 mm, or of 10 mm alone, where the case asks for one.
 
     As long as the longest case needs, whatever the case: noise depends on the length.
     """
@@ -142,7 +144,7 @@ def simulated(case: str, seed: int, *, target_free: bool) -> SimulatedRun:
     if case.startswith("bump"):
         rng = np.random.default_rng([seed, 77])
         axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-        turn, move = np.deg2rad(2.0) * axis, 0.01 * way
+        turn, move = (0.0 if case == MOVED else np.deg2rad(2.0)) * axis, 0.01 * way
         bumps = (Bump(AT_S + 2.0, tuple(turn.tolist()), tuple(move.tolist())),)
     rig = reference_rig(seed, timeshift_cam_imu_s=0.01, bumps=bumps)
     if not target_free:

@@ -277,10 +277,10 @@ class Calibrator:
         if motion is None:
             return []
         self._lost = None
-        if motion.turned is not None:  # copies from before know of no target that moved
-            self._past = RecentPast()
         f.restart_motion(motion)
-        self.watch.motion_restarted(motion.t_s)
+        if motion.turned is not None or not lost.jumped:  # copies from before know nothing of this motion
+            self._past.changed(f)
+        self.watch.motion_restarted(motion.t_s, gap=not lost.jumped)
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
 
     def _trim(self, needed_s: float) -> None:

@@ -230,6 +230,8 @@ class Recorder:
         try:
             for recovery in self._folder.recover():
                 _log.info("recovered %s: %d messages", recovery.output.name, recovery.messages)
+        except FileNotFoundError as error:  # moved or deleted meanwhile: `tick` reports a folder that is gone
+            _log.info("recovery in %s ended: %s", self._folder.path, error)
         except OSError as error:
             _log.warning("recovery in %s: %s", self._folder.path, error)
 

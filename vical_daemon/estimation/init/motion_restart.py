@@ -62,10 +62,14 @@ class MotionRestart:
         target: Points of the target, m, shape (n, 3).
         before_ns: Stamp of the last image used before, by camera, ns.
         jumped: Images stopped to fit without a gap: the target may have moved.
+
+    Attributes:
+        jumped: See above.
+        frames: Collected so far.
     """
 
     def __init__(self, target: FloatArray, before_ns: Mapping[str, int], *, jumped: bool = False) -> None:
-        self._target, self._jumped = target, jumped
+        self._target, self.jumped = target, jumped
         self._before_ns = dict(before_ns)
         self.frames: Frames = []
         self._seen: list[TargetPose | None] = []
@@ -116,7 +120,7 @@ class MotionRestart:
         found = LinearMotion.between(buffer, t_s, R, state.gyro_bias)
         if found is None:
             return None
-        turned = _turned(float(t_s[0]), R[0], f, buffer) if self._jumped else None
+        turned = _turned(float(t_s[0]), R[0], f, buffer) if self.jumped else None
         gravity = state.gravity if turned is None else turned @ state.gravity
         known = np.concatenate([np.zeros(3), gravity, np.zeros(3), state.accel_bias])
         start = linear_start(found, poses.p, np.ones(len(t_s)), unknown=[SPEED], known=known)
