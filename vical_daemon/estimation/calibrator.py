@@ -280,7 +280,7 @@ class Calibrator:
         f.restart_motion(motion)
         if motion.turned is not None or not lost.jumped:  # copies from before know nothing of this motion
             self._past.changed(f)
-        self.watch.motion_restarted(motion.t_s, gap=not lost.jumped)
+        self.watch.motion_restarted(motion.t_s)
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
 
     def _trim(self, needed_s: float) -> None:

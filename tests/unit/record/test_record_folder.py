@@ -70,6 +70,20 @@ def test_a_folder_that_was_moved_keeps_its_segment_and_the_recording_goes_on(
     assert [r.levelname for r in caplog.records if r.levelno > 20] == ["WARNING"]
 
 
+@pytest.mark.parametrize(("error", "warnings"), [(FileNotFoundError, 0), (PermissionError, 1)])
+def test_a_folder_that_goes_while_logs_are_recovered_is_reported_once(
+    recorder, monkeypatch, caplog, error, warnings
+):
+    """By `tick`: the thread that recovers them had warned as well, now and then."""
+
+    def fail():
+        raise error("log")
+
+    monkeypatch.setattr(recorder._folder, "recover", fail)
+    recorder._recover()
+    assert sum(r.levelname == "WARNING" for r in caplog.records) == warnings
+
+
 def test_a_deleted_folder_is_made_again(recorder, tmp_path):
     feed(recorder, 0, 5)
     shutil.rmtree(tmp_path / "log")

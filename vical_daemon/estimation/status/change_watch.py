@@ -128,17 +128,11 @@ class ChangeWatch:
         self.shift_reopened()
         self._pose_taken_s = float("-inf")
 
-    def motion_restarted(self, t_s: float, *, gap: bool) -> None:
-        """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose.
-
-        In a gap anything may have changed, and the motion hides it at first. So changes are looked for
-        without a sign.
-        """
+    def motion_restarted(self, t_s: float) -> None:
+        """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
         self._refused.clear()
         self._closer = self._suspected = 0
         self._pose_taken_s = t_s
-        if gap:
-            self._suspected, self._suspected_s, self._ask_at, self.why = 1, t_s, IMAGES, Cause.IMAGES_DISAGREE
 
     def shift_reopened(self) -> None:
         """A time shift is to be found again: what is known of its drift no longer holds."""
