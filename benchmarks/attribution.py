@@ -81,6 +81,13 @@ def _zoomed(factor: float, run: SimulatedRun) -> SimulatedRun:
     )
 
 
+def _biases_step(turn_dps: float, force_mps2: float, rig: Rig, rng: np.random.Generator) -> Rig:
+    """The biases of the IMU jump, in random directions."""
+    turn, force = _random_move(turn_dps, force_mps2, rng)
+    gyro, accel = rig.gyro_bias.with_step(AT_S, turn), rig.accel_bias.with_step(AT_S, force)
+    return replace(rig, gyro_bias=gyro, accel_bias=accel)
+
+
 def _apart(ppm: float, from_s: float, rig: Rig, rng: np.random.Generator) -> Rig:  # noqa: ARG001
     """Two crystals that differ, or that begin to."""
     return replace(rig, clock_skew_ppm=ppm, clock_skew_from_s=from_s)
@@ -162,6 +169,9 @@ CASES: dict[str, Case] = {
     "clocks 15 ppm apart from 20 s on": _is(*_DRIFT, rig=partial(_apart, 15.0, AT_S), sudden=True),
     "time shift steps by 2 ms": _is(Kind.TIMESHIFT_STEPPED, Kind.CLOCK_WANDER, rig=_stepped, sudden=True),
     "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(gaps.cut, "imu", 0.5)),
+    "biases of the imu step by 0.3 deg/s and 0.05 m/s^2": _is(
+        Kind.BIASES_STEPPED, rig=partial(_biases_step, 0.3, 0.05), sudden=True, board_only=True
+    ),
     "bump": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 2.0, 0.01), sudden=True),
     "camera moved by 5 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.005), sudden=True),
     "camera moved by 3 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.003), sudden=True),

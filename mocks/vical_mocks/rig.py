@@ -48,10 +48,17 @@ class BiasWalk:
     """
 
     def __init__(self, start: npt.ArrayLike, density: float, seed: int, step_s: float = 0.1) -> None:
-        self._density, self._step_s = density, step_s
+        self._density, self._seed, self._step_s = density, seed, step_s
         self._rng = np.random.default_rng([seed, 21])
         self._knots = np.asarray(start, np.float64)[None]
         self._lock = threading.Lock()
+        self._jump: tuple[float, FloatArray] | None = None
+
+    def with_step(self, at_s: float, step: npt.ArrayLike) -> BiasWalk:
+        """The same walk, but for a step from `at_s` on, in the unit of the bias, shape (3,)."""
+        other = BiasWalk(self._knots[0], self._density, self._seed, self._step_s)
+        other._jump = at_s, np.asarray(step, np.float64)
+        return other
 
     def value(self, t_s: npt.ArrayLike) -> FloatArray:
         """Bias at times `t_s`, shape (..., 3)."""
@@ -66,7 +73,11 @@ class BiasWalk:
             knots = self._knots
         i = np.floor(x).astype(np.int64)
         w = (x - i)[..., None]
-        return np.asarray(knots[i] * (1 - w) + knots[i + 1] * w)
+        out = np.asarray(knots[i] * (1 - w) + knots[i + 1] * w)
+        if self._jump is not None:
+            at_s, step = self._jump
+            out = out + (np.asarray(t_s) >= at_s)[..., None] * step
+        return out
 
 
 @dataclass(frozen=True)

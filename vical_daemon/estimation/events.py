@@ -25,6 +25,7 @@ class EventKind(StrEnum):
     STORED_HOLDS = "stored_holds"
     TIMESHIFT_STEPPED = "timeshift_stepped"
     LENS_STEPPED = "lens_stepped"
+    BIASES_STEPPED = "biases_stepped"
     POSE_LOST = "pose_lost"
     CLOCK_DRIFT = "clock_drift"
     CLOCK_WANDER = "clock_wander"

@@ -370,6 +370,10 @@ _EVENTS: dict[EventKind, Callable[[Event], str]] = {
         f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
         "a lens that is not fixed is estimated again, all else is kept"
     ),
+    EventKind.BIASES_STEPPED: lambda e: (
+        f"the biases of the IMU stepped, the gyro's by {_of(e, 180.0 / math.pi, 'deg/s', '.2f')}: "
+        "they are found again, all else is kept; does the IMU zero its gyro at rest?"
+    ),
     EventKind.POSE_LOST: lambda _: (
         "the target was moved, or the pose was lost: it is found again, the calibration is kept"
     ),

@@ -184,6 +184,24 @@ def test_a_change_is_announced_as_what_it_is_and_followed(bump, announced, not_a
     assert np.abs(x / sigma).max() < 4.5
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("size", [0.3, 1.0])
+def test_biases_that_step_are_no_bump(seed, size):
+    """An IMU that zeroes its gyro at rest, or takes a shock: it had been `bumped`, up to 57 sigma off."""
+    rng = np.random.default_rng([seed, 5])
+    gyro, accel = size * np.deg2rad(1.0) * rng.standard_normal(3), size * 0.2 * rng.standard_normal(3)
+    rig = reference_rig(seed)
+    rig = replace(rig, gyro_bias=rig.gyro_bias.with_step(14.0, gyro))
+    rig = replace(rig, accel_bias=rig.accel_bias.with_step(14.0, accel))
+    stepped = simulate(seed, 24.0, rig=rig, camera_rate_hz=10.0)
+    events = []
+    estimate = calibrate(stepped, each=lambda c: events.extend(c.estimate().events)).estimate()
+    assert [e.kind for e in events] == [EventKind.BIASES_STEPPED]
+    assert events[0].value == pytest.approx(np.linalg.norm(gyro), rel=0.1)
+    x, sigma = errors(estimate, stepped)
+    assert estimate.status == Status.CONVERGED and np.abs(x / sigma).max() < 3.5
+
+
 @pytest.mark.parametrize(("seed", "grown"), [(1, 1.05), (3, 1.02), (4, 0.97)])
 def test_a_lens_that_is_turned_is_no_bump(seed, grown):
     """As a bump, 5 % had put a lever arm 14 sigma off, `converged`, announced as a camera that moved."""

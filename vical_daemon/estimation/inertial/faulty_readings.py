@@ -22,10 +22,15 @@ _AT_RANGE = 8
 so many steps of its resolution at once to get there: a coarse channel at rest repeats its extreme, too."""
 _STOPS = 4
 """A channel in motion that stops for so many readings is at its range: noise and motion would go on."""
+_SLOWS = 1.5
+"""Steps of its resolution: a channel that comes to its extreme by less at once has slowed down: a crest."""
 _MOST = 0.75
 """Of the first readings, in which the other channels must change while one stops."""
 _OFTEN = 4.0
-"""Times as often as a value close to it must the extreme occur: without clipping it is the rarest of them."""
+"""Times as often as any value close to it must the extreme occur. Noise makes it the rarest of them; a swing
+stays in the last step of a coarse sensor for 2.4 times as long as in the one before."""
+_MORE = 2
+"""So many readings more at that value may be chance: only the way up to the crest may have been seen yet."""
 _NEAR = 0.9
 """Of the extreme: where values are close to it."""
 _SAME_RANGE = 0.99
@@ -147,9 +152,10 @@ class RangeLimits(Generic[T]):
             self._at[i] += 1
         elif value in values or len(values) < _VALUES:
             values[value] = values.get(value, 0) + 1
-        if value < self._extreme[i]:
+        step = self._step[i % 6 // 3]
+        if value < self._extreme[i] or (value > extreme and change < _SLOWS * step):
             self._stays[i] = 0
-        elif self._stays[i] or change >= _AT_RANGE * self._step[i % 6 // 3]:
+        elif self._stays[i] or change >= _AT_RANGE * step:
             self._stays[i] = self._stays[i] + 1 if value == extreme else 1
         if value == extreme:
             clips = self._stays[i] >= _STOPS or self._returns(i)
@@ -170,8 +176,7 @@ class RangeLimits(Generic[T]):
     def _returns(self, i: int) -> bool:
         """Whether the extreme of a channel has come back more often than an extreme does."""
         values = self._values[i]
-        usual = sum(values.values()) / max(len(values), 1)
-        return self._at[i] >= _AT_RANGE and len(values) >= _AT_RANGE and self._at[i] > _OFTEN * usual
+        return len(values) >= _AT_RANGE and self._at[i] > _OFTEN * (max(values.values()) + _MORE)
 
 
 def _measured_anew(three: Six, previous: Six) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.significance import LIKELY_SIGMAS
 from vical_daemon.estimation.status.mounting_changes import IRRELEVANT_PX, IRRELEVANT_S
@@ -28,22 +29,28 @@ class Known(NamedTuple):
         intrinsics_sigma: As reported, but for what stretches disagree, px, shape (4,); zeros: not estimated.
         timeshift_s: Time shift, s.
         timeshift_sigma_s: As reported, s.
+        biases: Of gyro, rad/s, and accelerometer, m/s^2, shape (6,).
+        biases_sigma: Likewise, as the filter knows them.
     """
 
     intrinsics: FloatArray
     intrinsics_sigma: FloatArray
     timeshift_s: float
     timeshift_sigma_s: float
+    biases: FloatArray
+    biases_sigma: FloatArray
 
     @classmethod
     def of(cls, f: CalibrationFilter) -> dict[str, Known]:
         """As a filter knows its cameras."""
         out, sigmas = {}, f.sigmas()
+        biases = np.concatenate([f.state.gyro_bias, f.state.accel_bias])
+        biases_sigma = np.concatenate([sigmas[GYRO_BIAS], sigmas[ACCEL_BIAS]])
         for name, camera in f.state.cameras.items():
             where, spread = f.layout.cameras[name], math.sqrt(f.consistency[name].factor)
             lens = np.zeros(4) if where.intrinsics is None else spread * sigmas[where.intrinsics]
             shift_s = 0.0 if where.timeshift is None else spread * float(sigmas[where.timeshift])
-            out[name] = cls(camera.intrinsics.copy(), lens, camera.timeshift_s, shift_s)
+            out[name] = cls(camera.intrinsics.copy(), lens, camera.timeshift_s, shift_s, biases, biases_sigma)
         return out
 
 
@@ -117,4 +124,8 @@ class PendingChange:
         stepped = np.abs(step_px) > np.maximum(open_px, IRRELEVANT_PX)
         if self.part is Part.LENS and not self.moved and stepped.any():
             return Event(EventKind.LENS_STEPPED, self.camera, float(step_px[0]))
+        step = now.biases - before.biases
+        open_step = LIKELY_SIGMAS * np.hypot(now.biases_sigma, before.biases_sigma)
+        if self.part is Part.BIASES and not self.moved and (np.abs(step) > open_step).any():
+            return Event(EventKind.BIASES_STEPPED, value=float(np.linalg.norm(step[:3])))
         return None

@@ -24,8 +24,17 @@ from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.priors import SKEW_SIGMA
-from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, VELOCITY, Layout, State
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, SKEW_SIGMA
+from vical_daemon.estimation.model.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+)
 from vical_daemon.estimation.status.recent_past import Taken
 
 _SHIFT_S = 5e-3
@@ -60,6 +69,7 @@ class Part(Enum):
     MOUNTINGS = auto()
     IMU = auto()
     LENS = auto()
+    BIASES = auto()
     TARGET = auto()
 
 
@@ -101,6 +111,10 @@ def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
         errors = [k for own in mountings.values() for k in own]
         out[Part.MOUNTINGS] = _columns(layout.size, errors, np.tile(sigmas, len(mountings)))
         out[Part.IMU] = _imu_moves(state, layout)
+    biases = [*every[GYRO_BIAS], *every[ACCEL_BIAS]]
+    out[Part.BIASES] = _columns(
+        layout.size, biases, np.repeat([GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2], 3)
+    )
     out[Part.TARGET] = _target_moves(state, layout.size)
     return out
 

@@ -10,6 +10,7 @@ from tests.unit.estimation.some_filter import some_filter
 from tests.unit.estimation.test_calibrator import calibrate, errors
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
+from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.status.pending_change import Known, PendingChange
 from vical_daemon.estimation.status.what_jumped import Part
@@ -57,6 +58,20 @@ def test_a_step_is_announced_if_it_exceeds_what_is_left_open(part, kind, step, s
     event = change.news(f)
     if certain:
         assert (event.kind, event.value) == (kind, pytest.approx(step))
+    else:
+        assert event is None
+
+
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_step_of_the_biases_is_announced_if_it_exceeds_what_is_left_open(certain):
+    f = some_filter()[0]
+    for row in range(GYRO_BIAS.start, ACCEL_BIAS.stop):
+        f.forget(row, 1e-4 if certain else 1e-2)
+    change = PendingChange(Part.BIASES, frozenset({Part.BIASES}), "cam0", 0.0, Known.of(f))
+    f.state.gyro_bias = f.state.gyro_bias + np.array([3e-3, 0.0, 4e-3])
+    event = change.news(f)
+    if certain:
+        assert (event.kind, event.value) == (EventKind.BIASES_STEPPED, pytest.approx(5e-3))
     else:
         assert event is None
 
