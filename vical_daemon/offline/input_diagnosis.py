@@ -12,6 +12,9 @@ from vical_daemon.offline.calibration_job import Job
 from vical_daemon.offline.errors import InputError
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
+_LEAST_HZ = 5.0
+"""Images a second without a target, as TD-ICP needs them; with a moving hand 4 started, 3 did not."""
+
 
 def diagnose_input(job: Job) -> str:
     """Name a mistake that explains why there is no calibration, in one line; empty where none does.
@@ -19,7 +22,7 @@ def diagnose_input(job: Job) -> str:
     Rotations first (a mirrored gyro, stamps at different rates), then the accelerometer's signs and axes.
     """
     if job.config.target is None:
-        return ""
+        return _too_few_images(job)
     from vical_daemon.vision.target import AprilGrid, load_target
 
     target = load_target(Path(job.config.target))
@@ -47,4 +50,16 @@ def diagnose_input(job: Job) -> str:
         )
         if mistake:
             return f"{name}: {mistake}"
+    return ""
+
+
+def _too_few_images(job: Job) -> str:
+    """Name a camera that is too slow for a calibration without a target."""
+    for name, stream in job.cameras.items():
+        if stream.rate_hz < _LEAST_HZ:
+            return (
+                f"{name}: its images come at {stream.rate_hz:.3g} Hz, too slowly to follow features from one "
+                f"to the next: without a target {_LEAST_HZ:g} Hz are needed, better 10; record faster, or "
+                "show a target and give --target"
+            )
     return ""

@@ -17,8 +17,8 @@ from vical_daemon.bus.messages import POINTS_TYPE, encode_compressed_image, enco
 from vical_daemon.bus.messages.schemas import DEFINITIONS
 from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.channel import stamp_of, with_stamp
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
 from vical_daemon.offline.calibration_job import make_job
 from vical_daemon.offline.errors import InputError
 
