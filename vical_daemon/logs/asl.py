@@ -20,7 +20,6 @@ from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 from vical_daemon.estimation.measurements import IntArray
 from vical_daemon.logs.asl_tables import (
     IMAGE_SUFFIXES,
-    accelerometer_first,
     columns_of,
     image_list,
     image_size,
@@ -42,6 +41,7 @@ from vical_daemon.logs.model import (
 )
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers
+from vical_daemon.logs.titled_columns import columns_by_title, reordered
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -237,15 +237,16 @@ class AslRecording(Recording):
     def _load(self, path: Path, sensor: str, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
+        title = text[: text.find(b"\n")].decode("utf-8", "replace")
+        named = columns_by_title(title) if dtype == _IMU_ROW else None
+        if named is not None and not named.in_order:
+            text = reordered(text, named)
+            self.warnings.append(
+                f"{sensor}: its title names the columns in another order; read by their names"
+            )
         whole = without_cut_line(text, columns_of(dtype))
         if len(whole) < len(text):
             self.warnings.append(f"{sensor}: the last line of {path.name} is cut off; 1 line left out")
-        title = text[: text.find(b"\n")].decode("utf-8", "replace")
-        if dtype == _IMU_ROW and accelerometer_first(title):
-            raise RecordingError(
-                f"{path}: its title names the accelerometer before the gyro; {columns} are expected in this "
-                "order: swap the columns"
-            )
         rows = load_table(whole, path, dtype, columns)
         try:
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())

@@ -124,14 +124,6 @@ def _fractional(text: bytes, begin: int, column: int) -> bool:
     return b"." in cell or b"e" in cell
 
 
-def accelerometer_first(title: str) -> bool:
-    """Whether the title of a table names the accelerometer before the gyro."""
-    names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
-    accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
-    gyro = [i for i, name in enumerate(names) if re.match(r"[wg](_|x|y|z)|gyr|ang|omega|rot", name)]
-    return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
-
-
 def columns_of(dtype: np.dtype[Any]) -> int:
     """How many columns a row of this type fills."""
     names = dtype.names or ()

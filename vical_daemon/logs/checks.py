@@ -22,6 +22,8 @@ measured turns with the gyro."""
 _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
+_NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
+_UNIT = 1e-2  # quaternions written with three digits
 _JUMP = 0.3  # rad/s, or of gravity: no motion does that from one reading to the next and back
 _NEARER = 5.0
 """Times that a jump is larger than the distance to one of the readings after it. Of noise in six channels,
@@ -88,12 +90,20 @@ def _check_one_device(name: str, samples: ImuArrays) -> None:
 
 
 def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlation: float) -> None:
+    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
+    if gyro > _NO_GYRO:
+        raise RecordingError(
+            f"{name}: the gyro reads {gyro:.3g} in the middle, rad/s are expected; are these its columns, "
+            "and not counts or stamps?"
+        )
     force = np.linalg.norm(samples.specific_force_mps2, axis=1)
     low, median = np.percentile(force, [5, 50]).tolist()
     if _LIKE_GRAVITY[0] < median < _LIKE_GRAVITY[1]:
         return
-    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
-    if _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
+    first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
+    if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
+        text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
+    elif _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
     elif constant:
         text = constant
