@@ -18,12 +18,9 @@ from vical_drivers.user_files import read_file
 from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encode_points
 from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.logs.asl_images import IMAGE_SUFFIXES, Images, image_list, image_size, images_by_name
 from vical_daemon.logs.asl_tables import (
-    IMAGE_SUFFIXES,
     columns_of,
-    image_list,
-    image_size,
-    images_by_name,
     imu_tables,
     load_table,
     read_table,
@@ -169,14 +166,12 @@ class AslRecording(Recording):
                     return self._read_points(path, folder.name, kind)
         for path in (folder / "data.csv", folder / "data.csv.gz"):
             if path.is_file():
-                return self._read_images(path, *image_list(path, folder))
-        stamps, files = images_by_name(folder)
-        if len(stamps) < len(files):
-            self.warnings.append(
-                f"{folder.name}: {len(files)} images have no stamps: there is no data.csv, and names like "
-                f"{files[0].name} are no times in ns"
-            )
-        return self._read_images(path, stamps, files, []) if stamps else None
+                return self._read_images(path, image_list(path, folder))
+        images = images_by_name(folder)
+        if images.stamps:
+            return self._read_images(folder / "data", images)
+        self.warnings.extend(f"{folder.name}: {text}" for text in images.warnings)
+        return None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
         rows = self._load(path, name, _POINT_ROW, "timestamp [ns], id, u and v columns")
@@ -200,14 +195,10 @@ class AslRecording(Recording):
         stream = replace(self._stream(kind, name, path, t_ns), extent_px=(float(extent[0]), float(extent[1])))
         return _Source(stream, t_ns, build)
 
-    def _read_images(self, table: Path, stamps: list[str], files: list[Path], lost: list[str]) -> _Source:
+    def _read_images(self, table: Path, images: Images) -> _Source:
         folder = table.parent
-        if lost and not stamps:
-            raise RecordingError(
-                f"{table} line 1: there is no image {lost[0]} next to it, nor any other listed"
-            )
-        if lost:
-            self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")
+        stamps, files, warnings = images
+        self.warnings.extend(f"{folder.name}: {text}" for text in warnings)
         if not stamps:
             raise RecordingError(f"{table}: no images listed")
         try:
