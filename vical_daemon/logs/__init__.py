@@ -76,7 +76,9 @@ def check_recording(recording: Recording) -> None:
             f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
         )
     for name in recording.imus:
-        recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
+        recording.warnings.extend(
+            check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
+        )
     for name, stream in recording.cameras.items():
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
         if stream.kind in ("image", "compressed"):

@@ -37,7 +37,7 @@ from vical_daemon.logs.model import (
     stream_statistics,
 )
 from vical_daemon.logs.stamp_column import column_ns
-from vical_daemon.logs.stamps import StampError, numbers
+from vical_daemon.logs.stamps import StampError, numbers, set_back_s
 from vical_daemon.logs.titled_columns import columns_by_title, reordered
 
 RIG = "rig0"
@@ -96,6 +96,7 @@ class AslRecording(Recording):
         self.rig = RIG
         self.warnings = []
         self.stamp_sigma_s = {}
+        self.set_back_s = {}
         self._as_recorded = as_recorded
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
@@ -249,6 +250,8 @@ class AslRecording(Recording):
                 f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp[:40]!r}{advice}"
             ) from None
         self._note_stamps(sensor, column.sigma_s, column.report)
+        if back_s := set_back_s(column.t_ns):
+            self.set_back_s[sensor] = back_s
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
             _refuse_lost_digits(path, rows["t"], column.t_ns)
         out = np.empty(len(rows), dtype)

@@ -36,8 +36,13 @@ _COPY = "is one of the files a copy of another?"
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
 
 
-def check_imu(name: str, samples: ImuArrays) -> list[str]:
+def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[str]:
     """Return warnings about an imu stream.
+
+    Args:
+        name: Of the imu.
+        samples: Its readings, in order of their stamps.
+        set_back_s: By how much its clock was set back during the recording, s.
 
     Raises:
         RecordingError: Its rate or its units are implausible.
@@ -45,6 +50,11 @@ def check_imu(name: str, samples: ImuArrays) -> list[str]:
     if len(samples.t_ns) < 20:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
     rate_hz = _check_imu_rate(name, samples.t_ns)
+    if set_back_s:
+        raise RecordingError(
+            f"{name}: its stamps go back by {set_back_s:.3g} s in the middle: its clock was set, or these "
+            "are two recordings; give the data before and after it as two recordings"
+        )
     _check_one_device(name, samples)
     constant = _constant_channels(samples)
     ratio, correlation = gyro_scale(samples, rate_hz)
@@ -85,7 +95,7 @@ def _check_one_device(name: str, samples: ImuArrays) -> None:
     if jumps.mean() > _JUMPS:
         raise RecordingError(
             f"{name}: its readings jump to and fro between two sets, as if two IMUs took turns in one topic "
-            "or file: record each on its own topic, or give each its own frame_id"
+            "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
         )
 
 

@@ -95,6 +95,7 @@ class Recording(ABC):
         warnings: Problems, one line each.
         stamp_sigma_s: By how much the stamps of a sensor may be off together, s: of those that were put on an
             even grid, or are written in coarse steps.
+        set_back_s: By how much the clock of a sensor was set back during the recording, s.
     """
 
     path: Path
@@ -102,6 +103,7 @@ class Recording(ABC):
     streams: tuple[Stream, ...]
     warnings: list[str]
     stamp_sigma_s: dict[str, float]
+    set_back_s: dict[str, float]
 
     @property
     def imus(self) -> dict[str, Stream]:

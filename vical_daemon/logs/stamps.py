@@ -17,6 +17,8 @@ _NAMED |= {"s": "s", "sec": "s"} | {word: unit for unit, word in UNIT_WORDS.item
 _LATEST_NS = 4_102_444_800 * FACTOR_NS["s"]  # the year 2100: no stamp lies behind it
 _APART_NS = 600 * FACTOR_NS["s"]
 """From the other stamps of a recording: ten minutes, longer than anyone rests within one."""
+_NEIGHBOURS = 5  # messages on either side of a step
+_BACK_S = 1.0  # more than any buffer delays a message of one sensor
 _FEW = 0.05
 """Share of the messages that may lie so far away and be mistakes: the first 3 s of a minute."""
 
@@ -150,3 +152,23 @@ def main_stretch(t_ns: IntArray) -> tuple[int, int] | None:
         return None
     begin = int(begins[largest])
     return int(ordered[begin]), int(ordered[begin + int(lengths[largest]) - 1])
+
+
+def set_back_s(t_ns: IntArray) -> float:
+    """Return by how much a clock was set back while it stamped these messages, in the order of the log, s.
+
+    0: it was not. Some messages of another order, or with wrong stamps, do not count, and neither do copies.
+
+    >>> set_back_s(np.array([*range(20), *range(-5, 15)]) * 10**9)
+    20.0
+    >>> set_back_s(np.array([*range(20), 10**6, *range(21, 40)]) * 10**9)
+    0.0
+    """
+    if len(t_ns) < 2 * _NEIGHBOURS:
+        return 0.0
+    at = int(np.argmin(np.diff(t_ns))) + 1
+    if t_ns[at] == t_ns[0]:
+        return 0.0  # a copy
+    before, after = t_ns[max(at - _NEIGHBOURS, 0) : at], t_ns[at : at + _NEIGHBOURS]
+    back_s = float(np.median(before) - np.median(after)) * 1e-9
+    return back_s if min(len(before), len(after)) == _NEIGHBOURS and back_s > _BACK_S else 0.0

@@ -149,3 +149,33 @@ def test_a_few_stamps_far_from_all_others_are_left_out_and_counted(tmp_path, a_m
     )
     assert not any("missing" in text for text in recording.warnings)
     assert min(stamp_of(payload) or 0 for _, payload in recording.messages()) == recording.begin_ns
+
+
+def test_a_clock_that_was_set_back_is_named(tmp_path, a_motion):
+    """Sorted by their stamps, the readings before and after it would be mixed."""
+    motion = a_motion()
+    items = imu(motion, "imu") + raw(motion)
+    late_ns = int(motion[0][1200])
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = {}
+        for stamp_ns, topic, kind, payload in sorted(items, key=lambda item: item[0]):
+            if topic not in channels:
+                schema = writer.register_schema(kind, "ros2msg", b"")
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            at_ns = stamp_ns - 5 * 10**9 * (stamp_ns > late_ns)
+            writer.add_message(channels[topic], at_ns, with_stamp(payload, at_ns), at_ns)
+        writer.finish()
+    with pytest.raises(
+        RecordingError, match=r"imu0: its stamps go back by (4\.9\d|5) s in .*: its clock was set"
+    ):
+        open_recording(tmp_path / "a.mcap")
+    assert open_recording(tmp_path / "a.mcap", check=False).imus["imu0"].count == len(motion[0])
+
+
+def test_a_table_whose_clock_was_set_back_is_named(tmp_path, a_motion, write_asl):
+    t_ns, gyro, force = a_motion()
+    t_ns = t_ns - 5 * 10**9 * (np.arange(len(t_ns)) > 1200)
+    with pytest.raises(RecordingError, match=r"imu0: its stamps go back by (4\.9\d|5) s"):
+        open_recording(write_asl(tmp_path / "a", imu=(t_ns, gyro, force)))
