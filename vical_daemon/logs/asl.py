@@ -38,7 +38,7 @@ from vical_daemon.logs.model import (
 )
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers, set_back_s
-from vical_daemon.logs.titled_columns import columns_by_title, reordered
+from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -230,6 +230,8 @@ class AslRecording(Recording):
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
         title = text[: text.find(b"\n")].decode("utf-8", "replace")
+        if dtype == _IMU_ROW and degrees_named(title):
+            raise RecordingError(f"{path}: {IN_DEGREES}")
         named = columns_by_title(title) if dtype == _IMU_ROW else None
         if named is not None and not named.in_order:
             text = reordered(text, named)

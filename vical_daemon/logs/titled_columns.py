@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
+IN_DEGREES = "its title gives the gyro in degrees; rad/s are expected: multiply by pi/180, correct the title"
 _IN_ORDER = tuple(range(7))
 _IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|ang\w*acc")
 _GYRO = re.compile(r"gyr|omega|ang\w*\W?(vel|rate|speed)|rot\w*\W?(vel|rate|speed)|^[wg]_?(rs_s)?_?[xyz]$")
 _ACCEL = re.compile(r"acc|specific|force|^a_?(rs_s)?_?[xyz]$|^f_?[xyz]$")
+_DEGREES = re.compile(r"deg|dps|°")
 _STAMP = re.compile(r"time|stamp|^ts?$|^ts_|^t_")
 _WHOLE, _REST = re.compile(r"stamp\W?secs?$"), re.compile(r"stamp\W?nsecs?$|stamp\W?nanosecs?$")
 
@@ -54,6 +56,16 @@ def columns_by_title(title: str) -> Columns | None:
         return None
     stamp, rest = _stamp_of(names, axes)
     return Columns((stamp, *axes), rest)
+
+
+def degrees_named(title: str) -> bool:
+    """Whether the title of a table gives rates in degrees: at rest, the readings do not show it.
+
+    >>> degrees_named("t,gx [deg/s],gy,gz"), degrees_named("t,gyro_x_dps,y"), degrees_named("t,gx [rad/s]")
+    (True, True, False)
+    """
+    names = [name.lower() for name in title.split(",")]
+    return any(_GYRO.search(_plain(name)) and _DEGREES.search(name) for name in names)
 
 
 def reordered(text: bytes, columns: Columns) -> bytes:

@@ -136,6 +136,14 @@ def test_other_columns_may_stand_between_if_the_title_names_all(tmp_path, write_
     assert any("the last line of data.csv is cut off" in text for text in recording.warnings)
 
 
+def test_a_gyro_in_degrees_by_its_title_is_refused(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    path.write_text(path.read_text().replace("w_x,w_y,w_z", "w_x [deg s^-1],w_y,w_z"))
+    with pytest.raises(RecordingError, match="title gives the gyro in degrees; rad/s are expected"):
+        open_recording(folder)
+
+
 @pytest.mark.parametrize(
     ("before", "says"),
     [
