@@ -53,6 +53,7 @@ class Channel:
         frames: The frame_ids of an imu, each with its number.
         which: Number of the frame_id of each message.
         turns: How often the frame_id changed.
+        head: The last frame_id as it is written, behind its length.
         even_ns: Of each of `stamps` the one to use instead.
         forces: Of each of `stamps`, from another topic; NaN where there is none.
     """
@@ -73,6 +74,7 @@ class Channel:
     frames: dict[bytes, int] = field(default_factory=dict)
     which: array[int] = field(default_factory=lambda: array("H"))
     turns: int = 0
+    head: bytes = b""
     even_ns: IntArray | None = None
     forces: FloatArray | None = None
 
@@ -80,6 +82,11 @@ class Channel:
     def resolution(self) -> tuple[int, int] | None:
         """Width and height of most images, px; None: not known."""
         return self.sizes.most_common(1)[0][0] if self.sizes else None
+
+    @property
+    def as_it_is(self) -> bool:
+        """Whether all messages with a stamp are used, with that stamp and these readings."""
+        return self.even_ns is None and self.forces is None and not self.unread_first and not self.strays
 
     def stamp_of(self, payload: bytes) -> int | None:
         """Return the stamp of a message of this topic; None if it is damaged."""
@@ -97,7 +104,10 @@ class Channel:
         if self.kind == "imu":
             self.values += payload[_GYRO]
             self.values += payload[_FORCE]
-            self._take_frame(frame_of(payload))
+            if self.which and payload.startswith(self.head, 12):
+                self.which.append(self.which[-1])
+            else:
+                self._take_frame(payload)
         else:
             self.marks.append(mark_of(payload))
             if self.kind in ("image", "compressed") or not self.sizes:
@@ -108,10 +118,12 @@ class Channel:
         self.stamps.append(stamp_ns)
         return stamp_ns
 
-    def _take_frame(self, frame: bytes) -> None:
-        number = self.frames.setdefault(frame, len(self.frames))
+    def _take_frame(self, payload: bytes) -> None:
+        frame = frame_of(payload)
+        number = min(self.frames.setdefault(frame, len(self.frames)), 65_535)
         self.turns += bool(self.which) and self.which[-1] != number
-        self.which.append(min(number, 65_535))
+        self.which.append(number)
+        self.head = payload[12 : 16 + len(frame)]
 
     def devices(self) -> dict[bytes, Channel]:
         """Return a channel for each frame_id if several devices take turns; else this one."""

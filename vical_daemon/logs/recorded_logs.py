@@ -326,14 +326,14 @@ class LogRecording(Recording):
             yield item.key, item.payload
 
     def _stamped(self, keys: set[str]) -> Iterator[Stamped]:
-        used = {topic: UsedMessages(channel) for topic, channel in self._channels.items()}
+        used = {t: UsedMessages(c) for t, c in self._channels.items() if not c.as_it_is}
         wanted = {topic: (c.key, c.kind == "imu") for topic, c in self._channels.items() if c.key in keys}
         wanted |= {topic: (key, False) for topic, key in self._statuses.items() if key in keys}
         for raw in self._dated():
             if raw.topic not in wanted:
                 continue
             payload, channel = raw.payload, self._channels.get(raw.topic)
-            if channel is None:
+            if channel is None or raw.topic not in used:
                 stamp_ns = stamp_of(payload)
                 if stamp_ns is None:
                     continue
