@@ -82,7 +82,7 @@ def row(name: str, key: str, rate_hz: float, build: Any, seconds: float) -> str:
 def receive(socket: str, key: str, pipe: Connection) -> None:
     """Note the age of every message by its stamp (both processes share CLOCK_MONOTONIC)."""
     from vical_daemon.bus.zenoh_bus import open_bus
-    from vical_daemon.logs.recorded_logs import stamp_of
+    from vical_daemon.logs.channel import stamp_of
 
     bus = open_bus(mode="client", socket=socket)
     ages_ms: list[float] = []

@@ -32,7 +32,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.topics import STATUS
 from vical_daemon.config.model import LOG_SCHEME
 from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.channel import stamp_of
 
 _IMU_KINDS = ("imu",)
 _IMAGE_KINDS = ("image", "compressed")

@@ -16,6 +16,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import COLUMNS
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.asl_tables import TABLE_LIMIT
+from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 _LIVELY = 5.0  # scatter of the gyro within a second over that of the quietest ones
@@ -170,6 +171,12 @@ def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, 
 def _read_csv(path: Path) -> tuple[IntArray, FloatArray, FloatArray, str]:
     try:
         text = read_text(path, TABLE_LIMIT)
+        title = text[: text.find("\n")]
+        if degrees_named(title):
+            raise CliError(f"{path}: {IN_DEGREES}")
+        named = columns_by_title(title)
+        if named is not None and not named.in_order:
+            text = reordered(text.encode(), named).decode()
         first = next(csv.reader(io.StringIO(text)), [])
         if not first:
             raise CliError(f"{path}: is empty")

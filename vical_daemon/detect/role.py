@@ -54,6 +54,7 @@ class DetectRole:
     Attributes:
         wrong_target: What the images contradict in the target file, one line; "": nothing is known.
         refused: Number of images of another size than that of the config.
+        malformed: Number of images that cannot be read.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class DetectRole:
         self._problem = self._why_malformed = ""
         self.rate_hz = config.calibration.detect_rate_hz  # images per second at most
         self._next_ns = 0.0
-        self._images = self._found = self._malformed = self._skipped = self._failures = self.refused = 0
+        self._images = self._found = self._skipped = self._failures = self.malformed = self.refused = 0
         self._busy_s = 0.0
 
     def points(self, sample: Sample) -> list[Message]:
@@ -90,7 +91,7 @@ class DetectRole:
         try:
             stamp_ns, image = _decode(sample)
         except (MessageError, ValueError) as error:
-            self._malformed += 1
+            self.malformed += 1
             self._why_malformed = str(error)
             return []
         height, width = image.shape[:2]
@@ -157,7 +158,7 @@ class DetectRole:
             "with_points": str(self._found),
             "skipped": str(self._skipped),
             "dropped": str(dropped),
-            "malformed": str(self._malformed),
+            "malformed": str(self.malformed),
             "of_another_size": str(self.refused),
             "failures": str(self._failures),
             "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
@@ -169,8 +170,8 @@ class DetectRole:
             found, size = ("{} x {}".format(*one) for one in (self._other_size, self._size))
             text = f"images are {found} px, not {size} as in the config: not used"
             return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
-        if self._malformed and not self._images:
-            text = f"none of {self._malformed} images can be read: {self._why_malformed}"
+        if self.malformed and not self._images:
+            text = f"none of {self.malformed} images can be read: {self._why_malformed}"
             return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK

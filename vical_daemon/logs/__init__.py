@@ -76,9 +76,19 @@ def check_recording(recording: Recording) -> None:
             f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
         )
     for name in recording.imus:
-        recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
-    for stream in recording.cameras.values():
+        recording.warnings.extend(
+            check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
+        )
+    for name, stream in recording.cameras.items():
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
+        if stream.kind in ("image", "compressed"):
+            others = [
+                s for s in recording.streams if s.name == name and s not in (stream, recording.imus.get(name))
+            ]
+            recording.warnings.extend(
+                f"{name}: {stream.source} is used ({stream.count} images), not {s.source} ({s.count})"
+                for s in others
+            )
 
 
 _NEEDED = "expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder (with mav0/imu0/data.csv)"

@@ -18,13 +18,9 @@ from vical_drivers.user_files import read_file
 from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encode_points
 from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.logs.asl_images import IMAGE_SUFFIXES, Images, image_list, image_size, images_by_name
 from vical_daemon.logs.asl_tables import (
-    IMAGE_SUFFIXES,
-    accelerometer_first,
     columns_of,
-    image_list,
-    image_size,
-    images_by_name,
     imu_tables,
     load_table,
     read_table,
@@ -41,7 +37,8 @@ from vical_daemon.logs.model import (
     stream_statistics,
 )
 from vical_daemon.logs.stamp_column import column_ns
-from vical_daemon.logs.stamps import StampError, numbers
+from vical_daemon.logs.stamps import StampError, numbers, set_back_s
+from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -99,6 +96,7 @@ class AslRecording(Recording):
         self.rig = RIG
         self.warnings = []
         self.stamp_sigma_s = {}
+        self.set_back_s = {}
         self._as_recorded = as_recorded
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
@@ -169,14 +167,12 @@ class AslRecording(Recording):
                     return self._read_points(path, folder.name, kind)
         for path in (folder / "data.csv", folder / "data.csv.gz"):
             if path.is_file():
-                return self._read_images(path, *image_list(path, folder))
-        stamps, files = images_by_name(folder)
-        if len(stamps) < len(files):
-            self.warnings.append(
-                f"{folder.name}: {len(files)} images have no stamps: there is no data.csv, and names like "
-                f"{files[0].name} are no times in ns"
-            )
-        return self._read_images(path, stamps, files, []) if stamps else None
+                return self._read_images(path, image_list(path, folder))
+        images = images_by_name(folder)
+        if images.stamps:
+            return self._read_images(folder / "data", images)
+        self.warnings.extend(f"{folder.name}: {text}" for text in images.warnings)
+        return None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
         rows = self._load(path, name, _POINT_ROW, "timestamp [ns], id, u and v columns")
@@ -200,14 +196,10 @@ class AslRecording(Recording):
         stream = replace(self._stream(kind, name, path, t_ns), extent_px=(float(extent[0]), float(extent[1])))
         return _Source(stream, t_ns, build)
 
-    def _read_images(self, table: Path, stamps: list[str], files: list[Path], lost: list[str]) -> _Source:
+    def _read_images(self, table: Path, images: Images) -> _Source:
         folder = table.parent
-        if lost and not stamps:
-            raise RecordingError(
-                f"{table} line 1: there is no image {lost[0]} next to it, nor any other listed"
-            )
-        if lost:
-            self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")
+        stamps, files, warnings = images
+        self.warnings.extend(f"{folder.name}: {text}" for text in warnings)
         if not stamps:
             raise RecordingError(f"{table}: no images listed")
         try:
@@ -237,15 +229,18 @@ class AslRecording(Recording):
     def _load(self, path: Path, sensor: str, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
+        title = text[: text.find(b"\n")].decode("utf-8", "replace")
+        if dtype == _IMU_ROW and degrees_named(title):
+            raise RecordingError(f"{path}: {IN_DEGREES}")
+        named = columns_by_title(title) if dtype == _IMU_ROW else None
+        if named is not None and not named.in_order:
+            text = reordered(text, named)
+            self.warnings.append(
+                f"{sensor}: its title names the columns in another order; read by their names"
+            )
         whole = without_cut_line(text, columns_of(dtype))
         if len(whole) < len(text):
             self.warnings.append(f"{sensor}: the last line of {path.name} is cut off; 1 line left out")
-        title = text[: text.find(b"\n")].decode("utf-8", "replace")
-        if dtype == _IMU_ROW and accelerometer_first(title):
-            raise RecordingError(
-                f"{path}: its title names the accelerometer before the gyro; {columns} are expected in this "
-                "order: swap the columns"
-            )
         rows = load_table(whole, path, dtype, columns)
         try:
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
@@ -257,6 +252,8 @@ class AslRecording(Recording):
                 f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp[:40]!r}{advice}"
             ) from None
         self._note_stamps(sensor, column.sigma_s, column.report)
+        if back_s := set_back_s(column.t_ns):
+            self.set_back_s[sensor] = back_s
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
             _refuse_lost_digits(path, rows["t"], column.t_ns)
         out = np.empty(len(rows), dtype)

@@ -1,4 +1,4 @@
-"""Tables and small files of an ASL/EuRoC folder: numbers, lists of images, the size of the images."""
+"""Tables of an ASL/EuRoC folder: numbers, packed or not. Its images: `asl_images`."""
 
 from __future__ import annotations
 
@@ -13,20 +13,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from vical_drivers.user_files import open_file, read_file, read_text
+from vical_drivers.user_files import open_file, read_file
 
-from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
-from vical_daemon.logs.encoded_size import HEAD, encoded_size
 from vical_daemon.logs.model import RecordingError
 
-_NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
-IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"} | {
-    f".{kind}": kind for kind in ("pgm", "ppm", "bmp")
-}
-_STAMP_DIGITS = 13
-"""Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
 _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
@@ -124,14 +116,6 @@ def _fractional(text: bytes, begin: int, column: int) -> bool:
     return b"." in cell or b"e" in cell
 
 
-def accelerometer_first(title: str) -> bool:
-    """Whether the title of a table names the accelerometer before the gyro."""
-    names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
-    accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
-    gyro = [i for i, name in enumerate(names) if re.match(r"[wg](_|x|y|z)|gyr|ang|omega|rot", name)]
-    return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
-
-
 def columns_of(dtype: np.dtype[Any]) -> int:
     """How many columns a row of this type fills."""
     names = dtype.names or ()
@@ -181,46 +165,6 @@ def _first_data_row(text: bytes) -> int:
     return 0
 
 
-def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[str]]:
-    """Return stamps and files of ``data.csv``, and names without a file; names cannot leave the folder."""
-    stamps: list[str] = []
-    files, lost = [], []
-    for number, line in enumerate(read_table(table).decode("utf-8", "replace").splitlines(), 1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        stamp, _, name = (part.strip() for part in line.partition(","))
-        name = name.split(",")[0].strip() or f"{stamp}.png"
-        if not _NUMBER.fullmatch(stamp) or Path(name).name != name:
-            raise RecordingError(
-                f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
-            )
-        path = next((p for p in (folder / "data" / name, folder / name) if p.is_file()), None)
-        if path is None:
-            lost.append(name)
-            continue
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
-            raise RecordingError(f"{path}: images must be png, jpg, pgm, ppm or bmp")
-        stamps.append(stamp)
-        files.append(path)
-    return stamps, files, lost
-
-
-def images_by_name(folder: Path) -> tuple[list[str], list[Path]]:
-    """Return stamps and files of images without ``data.csv``; no stamps where they are not named by these.
-
-    Kalibr's `kalibr_bagcreater` reads such folders (ns); names like ``1305031102.175304`` are seconds. Images
-    that are merely numbered have no stamps.
-    """
-    places = [place for place in (folder / "data", folder) if place.is_dir()]
-    images = [p for place in places for p in sorted(place.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES]
-    stamped = bool(images) and all(_is_stamp(p.stem) for p in images)
-    return [p.stem for p in images] if stamped else [], images
-
-
-def _is_stamp(name: str) -> bool:
-    return len(name) >= _STAMP_DIGITS and re.fullmatch(r"[0-9]+(\.[0-9]+)?", name) is not None
-
-
 def imu_tables(root: Path) -> dict[str, Path]:
     """Return the tables of inertial readings of a folder by the names of the IMUs, in order of these.
 
@@ -231,25 +175,3 @@ def imu_tables(root: Path) -> dict[str, Path]:
     for name in ("data.csv.gz", "data.csv"):
         found |= {p.parent.name: p for p in root.glob(f"imu*/{name}")}
     return dict(sorted(found.items()))
-
-
-def image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the size of the images from ``sensor.yaml`` or the first image."""
-    sensor = folder / "sensor.yaml"
-    if sensor.is_file():
-        import yaml
-
-        try:
-            text = read_text(sensor, MAX_BYTES)
-            refuse_hostile(text, sensor.name)
-            size = yaml.safe_load(text)["resolution"]
-            return int(size[0]), int(size[1])
-        except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
-            pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
-    places = (folder / "data", folder)
-    images = (p for place in places if place.is_dir() for p in sorted(place.iterdir()))
-    first = next((p for p in images if p.suffix.lower() in IMAGE_SUFFIXES), None)
-    if first is None:
-        return None
-    with open_file(first) as file:
-        return encoded_size(file.read(HEAD))

@@ -22,13 +22,27 @@ measured turns with the gyro."""
 _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
+_NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
+_UNIT = 1e-2  # quaternions written with three digits
+_JUMP = 0.3  # rad/s, or of gravity: no motion does that from one reading to the next and back
+_NEARER = 5.0
+"""Times that a jump is larger than the distance to one of the readings after it. Of noise in six channels,
+1 in 1000 is."""
+_JUMPS = 0.2
+"""Share of such jumps from which on two devices take turns; 0.3 if one is four times as fast, none on real
+recordings of one."""
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 _COPY = "is one of the files a copy of another?"
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
 
 
-def check_imu(name: str, samples: ImuArrays) -> list[str]:
+def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[str]:
     """Return warnings about an imu stream.
+
+    Args:
+        name: Of the imu.
+        samples: Its readings, in order of their stamps.
+        set_back_s: By how much its clock was set back during the recording, s.
 
     Raises:
         RecordingError: Its rate or its units are implausible.
@@ -36,6 +50,12 @@ def check_imu(name: str, samples: ImuArrays) -> list[str]:
     if len(samples.t_ns) < 20:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
     rate_hz = _check_imu_rate(name, samples.t_ns)
+    if set_back_s:
+        raise RecordingError(
+            f"{name}: its stamps go back by {set_back_s:.3g} s in the middle: its clock was set, or these "
+            "are two recordings; give the data before and after it as two recordings"
+        )
+    _check_one_device(name, samples)
     constant = _constant_channels(samples)
     ratio, correlation = gyro_scale(samples, rate_hz)
     _check_accelerometer(name, samples, constant, correlation)
@@ -67,13 +87,33 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     return rate_hz
 
 
+def _check_one_device(name: str, samples: ImuArrays) -> None:
+    """Refuse the readings of two devices that are mounted differently, in one stream."""
+    six = np.hstack([samples.gyro_rps, samples.specific_force_mps2 / GRAVITY_MPS2])
+    ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
+    jumps = (ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))
+    if jumps.mean() > _JUMPS:
+        raise RecordingError(
+            f"{name}: its readings jump to and fro between two sets, as if two IMUs took turns in one topic "
+            "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
+        )
+
+
 def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlation: float) -> None:
+    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
+    if gyro > _NO_GYRO:
+        raise RecordingError(
+            f"{name}: the gyro reads {gyro:.3g} in the middle, rad/s are expected; are these its columns, "
+            "and not counts or stamps?"
+        )
     force = np.linalg.norm(samples.specific_force_mps2, axis=1)
     low, median = np.percentile(force, [5, 50]).tolist()
     if _LIKE_GRAVITY[0] < median < _LIKE_GRAVITY[1]:
         return
-    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
-    if _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
+    first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
+    if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
+        text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
+    elif _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
     elif constant:
         text = constant

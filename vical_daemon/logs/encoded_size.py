@@ -10,12 +10,13 @@ _JPEG = b"\xff\xd8"
 _PGM_PPM = re.compile(rb"P[2356](?:\s+(?:#[^\n]*\n\s*)*)(\d{1,6})(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,6})\s")
 _BMP_HEADER = 40  # bytes of the usual one and at least of the later ones; sizes have 4 bytes each
 _NO_FRAME = {0xC4, 0xC8, 0xCC}  # of the markers C0 to CF: tables and an extension, no frame header
+LARGEST_PX = 2**27  # as `vical_daemon.vision` sets it for OpenCV: larger ones are not read
 HEAD = 65_536
 """Bytes that are enough for most images: before its size, a JPEG may hold a preview of up to 64 kB."""
 
 
 def encoded_size(data: bytes | memoryview) -> tuple[int, int] | None:
-    """Return width and height of an image, px; None: of another kind, or its header is damaged.
+    """Return width and height of an image, px; None: of another kind, damaged or too large.
 
     PNG: W3C, Portable Network Graphics, 11.2.2. JPEG: ITU-T T.81, B.1.1 and B.2.2. PGM, PPM: netpbm's pgm(5)
     and ppm(5). BMP: Microsoft's BITMAPINFOHEADER, whose height is negative if the top row comes first.
@@ -31,7 +32,7 @@ def encoded_size(data: bytes | memoryview) -> tuple[int, int] | None:
     elif data.startswith(b"BM") and len(data) >= 26 and struct.unpack_from("<I", data, 14)[0] >= _BMP_HEADER:
         width, height = struct.unpack_from("<ii", data, 18)
         size = width, abs(height)
-    return size if size is not None and all(size) else None
+    return size if size is not None and 0 < size[0] * size[1] <= LARGEST_PX else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush, merge
 from pathlib import Path
@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFra
 Kind = Literal["imu", "image", "compressed", "points", "tracks"]
 # Preferred stream of a camera that has several: points before images.
 PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
+_MANY_MORE = 1.1  # times: the noise of compression costs less than a tenth of the images does
 _WINDOW_NS = 2_000_000_000
 _WINDOW_BYTES = 512 * 2**20
 _MARK_NS = 50_000_000
@@ -25,6 +26,18 @@ _MARK_NS = 50_000_000
 
 class RecordingError(Exception):
     """A recording that cannot be used; the message is one line: what, where, what to try."""
+
+
+def preferred(streams: Sequence[tuple[Kind, int]]) -> int:
+    """Return which of the streams of one camera, each with its number of messages, is to be used.
+
+    Compressed pictures only where many of the raw ones are missing: a busy recorder drops those first.
+    """
+    best = min(range(len(streams)), key=lambda i: PREFERENCE.index(streams[i][0]))
+    for i, (kind, count) in enumerate(streams):
+        if streams[best][0] == "image" and kind == "compressed" and count > _MANY_MORE * streams[best][1]:
+            best = i
+    return best
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +95,7 @@ class Recording(ABC):
         warnings: Problems, one line each.
         stamp_sigma_s: By how much the stamps of a sensor may be off together, s: of those that were put on an
             even grid, or are written in coarse steps.
+        set_back_s: By how much the clock of a sensor was set back during the recording, s.
     """
 
     path: Path
@@ -89,6 +103,7 @@ class Recording(ABC):
     streams: tuple[Stream, ...]
     warnings: list[str]
     stamp_sigma_s: dict[str, float]
+    set_back_s: dict[str, float]
 
     @property
     def imus(self) -> dict[str, Stream]:
@@ -98,10 +113,11 @@ class Recording(ABC):
     @property
     def cameras(self) -> dict[str, Stream]:
         """Cameras by name, each with the stream it is best calibrated from."""
-        best: dict[str, Stream] = {}
-        for kind in reversed(PREFERENCE):
-            best.update({stream.name: stream for stream in self.streams if stream.kind == kind})
-        return dict(sorted(best.items()))
+        found: dict[str, list[Stream]] = {}
+        for stream in self.streams:
+            if stream.kind != "imu":
+                found.setdefault(stream.name, []).append(stream)
+        return {name: s[preferred([(x.kind, x.count) for x in s])] for name, s in sorted(found.items())}
 
     @property
     def imu_samples(self) -> int:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 from abc import abstractmethod
-from array import array
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -24,17 +21,13 @@ from vical_daemon.bus.messages import (
     MessageError,
     decode_compressed_image,
     decode_image,
-    decode_imu,
-    decode_points,
 )
 from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
-from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.encoded_size import encoded_size
-from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
+from vical_daemon.logs.channel import Channel, UsedMessages, frame_of, stamp_of, with_force, with_stamp
+from vical_daemon.logs.even_images import CameraStamps, PointReader
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogReader, segments_in, size_now
 from vical_daemon.logs.model import (
-    PREFERENCE,
     ImuArrays,
     Kind,
     OutOfReach,
@@ -44,9 +37,11 @@ from vical_daemon.logs.model import (
     Stream,
     in_stamp_order,
     merged,
+    preferred,
     stream_statistics,
 )
 from vical_daemon.logs.stamp_column import coarseness
+from vical_daemon.logs.stamps import set_back_s
 from vical_daemon.logs.united_imu import forces_at, lacks
 
 _KIND_OF_TYPE: dict[str, Kind] = {
@@ -56,11 +51,6 @@ _KIND_OF_TYPE: dict[str, Kind] = {
     POINTS_TYPE: "points",
     TRACKS_TYPE: "tracks",
 }
-_STAMP = struct.Struct("<iI")
-_ZSTD = b"\x28\xb5\x2f\xfd"  # RFC 8878
-# Offsets of rates and forces from the end of a sensor_msgs/Imu.
-_GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
-_IMU_NUMBERS = 37 * 8
 _PLAIN_WORDS = {
     "image_raw",
     "image_mono",
@@ -96,24 +86,6 @@ class RawMessage(NamedTuple):
     payload: bytes
 
 
-@dataclass(slots=True)
-class _Channel:
-    """One topic that is used, during the scan."""
-
-    key: str
-    kind: Kind
-    name: str
-    stamps: array[int] = field(default_factory=lambda: array("q"))
-    marks: array[int] = field(default_factory=lambda: array("q"))  # of images, see `mark_of`
-    log_times: array[int] = field(default_factory=lambda: array("q"))  # of messages whose stamp is 0
-    values: bytearray = field(default_factory=bytearray)
-    resolution: tuple[int, int] | None = None
-    unreadable: int = 0
-    problem: str = ""  # why the first one was unreadable
-    even_ns: IntArray | None = None  # of each of `stamps` the one to use instead
-    forces: FloatArray | None = None  # of each of `stamps`, from another topic; NaN where there is none
-
-
 class LogRecording(Recording):
     """Base of all logs of ROS messages; a subclass iterates over the messages."""
 
@@ -134,12 +106,14 @@ class LogRecording(Recording):
         self.rig = _RIG
         self.warnings = []
         self.stamp_sigma_s = {}
+        self.set_back_s = {}
         self._scanned = False
         self._wanted = None if topics is None else set(topics)
-        self._channels: dict[str, _Channel] = {}
+        self._channels: dict[str, Channel] = {}
         self._others: dict[str, str] = {}
         self._statuses: dict[str, str] = {}  # key of each topic with our status messages
         self._undated: set[str] = set()  # topics whose messages are dated by their log times
+        self._split: set[str] = set()  # topics on which several devices publish in turns
         self._order = OutOfReach()
         self._scan()
         self._scanned = True
@@ -166,27 +140,13 @@ class LogRecording(Recording):
         return self._raw()
 
     def _scan(self) -> None:
-        for raw in self._raw():
+        for raw in self._dated():
             channel = self._channels.get(raw.topic) or self._meet(raw)
             if channel is None:
                 continue
-            stamp_ns = stamp_of(raw.payload)
-            if channel.kind == "imu" and not _has_imu_size(raw.payload):
-                stamp_ns = None
-            if stamp_ns is None or (not channel.stamps and not _readable(channel, raw.payload)):
-                channel.unreadable += 1
-                if raw.payload.startswith(_ZSTD):
-                    channel.problem = "each is packed by zstd: give the bag with its metadata.yaml"
-                continue
-            if channel.kind == "imu":
-                channel.values += raw.payload[_GYRO]
-                channel.values += raw.payload[_FORCE]
-            else:
-                channel.marks.append(mark_of(raw.payload))
-            if stamp_ns == 0:
-                channel.log_times.append(raw.log_time_ns)
-            channel.stamps.append(stamp_ns)
-            self._order.saw(stamp_ns or raw.log_time_ns, raw.log_time_ns)
+            stamp_ns = channel.take(raw.payload, raw.log_time_ns)
+            if stamp_ns is not None:
+                self._order.saw(stamp_ns or raw.log_time_ns, raw.log_time_ns)
         for topic, channel in self._channels.items():
             if len(channel.log_times) > 1 and len(channel.log_times) == len(channel.stamps):
                 self._undated.add(topic)
@@ -196,15 +156,55 @@ class LogRecording(Recording):
                 why = f" ({channel.problem})" if channel.problem else ""
                 text = f"{channel.name}: {channel.unreadable} unreadable messages left out{why}"
                 self.warnings.append(text)
+        self._tell_devices_apart()
+        for channel in self._channels.values():
+            channel.leave_out_strays()
+            if back_s := set_back_s(channel.t_ns()):
+                self.set_back_s[channel.name] = back_s
+            if channel.strays:
+                count = f"{channel.strays} of {channel.strays + len(channel.stamps)} messages"
+                self.warnings.append(f"{channel.name}: {count} left out: stamps far from all others, or 0")
+            if len(channel.sizes) > 1:
+                (size, most), *others = channel.sizes.most_common()
+                self.warnings.append(
+                    f"{channel.name}: {sum(n for _, n in others)} images are not {size[0]} x {size[1]} as "
+                    f"{most} are, and are not used"
+                )
+
+    def _tell_devices_apart(self) -> None:
+        """Make one imu of each frame_id on a topic on which several publish in turns."""
+        for topic, channel in list(self._channels.items()):
+            devices = channel.devices()
+            if len(devices) == 1:
+                continue
+            self._split.add(topic)
+            del self._channels[topic]
+            for frame, part in devices.items():
+                part.name = self._name(frame.rstrip(b"\0").decode("utf-8", "replace"), "imu")
+                part.key = BY_KIND["imu"].key(self.rig, part.name)
+                self._channels[_with_frame(topic, frame)] = part
+            names = ", ".join(part.name for part in devices.values())
+            self.warnings.append(
+                f"{topic}: {len(devices)} devices publish on it in turns; by their frame_id they are {names}"
+            )
 
     def _dated(self) -> Iterator[RawMessage]:
-        """Yield all messages; those of topics without stamps have their log times as stamps."""
+        """Yield all messages; those of topics without stamps have their log times as stamps.
+
+        A second type of message on one topic is a topic of its own, and likewise a second imu, once known.
+        """
+        types: dict[str, str] = {}
         for raw in self._raw():
+            topic = raw.topic
+            if raw.type_name in _KIND_OF_TYPE and types.setdefault(topic, raw.type_name) != raw.type_name:
+                raw = raw._replace(topic=f"{topic} ({raw.type_name})")
             if raw.topic in self._undated and stamp_of(raw.payload) is not None:
                 raw = raw._replace(payload=with_stamp(raw.payload, raw.log_time_ns))
+            if topic in self._split:
+                raw = raw._replace(topic=_with_frame(topic, frame_of(raw.payload)))
             yield raw
 
-    def _meet(self, raw: RawMessage) -> _Channel | None:
+    def _meet(self, raw: RawMessage) -> Channel | None:
         """Classify a topic by its first message."""
         kind = _KIND_OF_TYPE.get(raw.type_name)
         parsed = parse_key(raw.topic.removeprefix("/"))
@@ -220,14 +220,14 @@ class LogRecording(Recording):
         if parsed is not None:
             name, key = parsed.name, raw.topic.removeprefix("/")
         else:
-            name = self._name(raw.topic, kind)
+            name = self._name(raw.topic.split(" ")[0], kind)
             key = BY_KIND[kind].key(self.rig, name)
         if self._wanted is not None and not {raw.topic, raw.topic.removeprefix("/"), name} & self._wanted:
             self._others[raw.topic] = raw.type_name
             return None
         if parsed is not None:
             self._belongs_to(parsed.rig, kind, name)
-        channel = self._channels[raw.topic] = _Channel(key, kind, name)
+        channel = self._channels[raw.topic] = Channel(key, kind, name)
         return channel
 
     def _belongs_to(self, rig: str, kind: Kind, name: str) -> None:
@@ -248,17 +248,17 @@ class LogRecording(Recording):
             free, number = f"{name}_{number}", number + 1
         return free
 
-    def _note_steps(self, channel: _Channel) -> None:
+    def _note_steps(self, channel: Channel) -> None:
         """Note by how much all stamps may be off together as they are rounded."""
-        report, sigma_s = coarseness(_stamps(channel))
+        report, sigma_s = coarseness(channel.t_ns())
         if report:
             self.warnings.append(f"{channel.name}: {report}")
         if sigma_s:
             self.stamp_sigma_s[channel.name] = sigma_s
 
-    def _even(self, channel: _Channel) -> None:
+    def _even(self, channel: Channel) -> None:
         """Put readings that were stamped on arrival on an even grid."""
-        stamps, values = np.array(channel.stamps, dtype=np.int64), _values(channel)
+        stamps, values = np.array(channel.stamps, dtype=np.int64), channel.imu_values()
         if not np.isfinite(values).all():
             return
         even = even_stamps(stamps, values[:, :3])
@@ -272,14 +272,14 @@ class LogRecording(Recording):
     def _unite(self) -> None:
         """Give a gyro without an accelerometer the readings of an accelerometer that has no gyro."""
         imus = {t: c for t, c in self._channels.items() if c.kind == "imu" and c.stamps}
-        lacking = {topic: lacks(_values(channel)) for topic, channel in imus.items()}
+        lacking = {topic: lacks(channel.imu_values()) for topic, channel in imus.items()}
         gyros, accels = ([t for t, x in lacking.items() if x == y] for y in ("accelerometer", "gyro"))
         if len(gyros) != 1 or len(accels) != 1:
             return
         gyro, accel = self._channels[gyros[0]], self._channels.pop(accels[0])
         self._others[accels[0]] = IMU_TYPE
-        values = _values(gyro).copy()
-        values[:, 3:] = forces_at(_stamps(gyro), _stamps(accel), _values(accel)[:, 3:])
+        values = gyro.imu_values().copy()
+        values[:, 3:] = forces_at(gyro.t_ns(), accel.t_ns(), accel.imu_values()[:, 3:])
         gyro.forces = values[:, 3:]
         gyro.values = bytearray(values.tobytes())
         self.warnings.append(
@@ -291,12 +291,12 @@ class LogRecording(Recording):
         images = [(t, c) for t, c in self._channels.items() if c.kind != "imu" and c.stamps]
         for name in dict.fromkeys(channel.name for _, channel in images):
             of_it = [(t, c) for t, c in images if c.name == name]
-            topic, channel = min(of_it, key=lambda item: PREFERENCE.index(item[1].kind))
-            stamps = CameraStamps(_stamps(channel), np.array(channel.marks, dtype=np.int64))
+            topic, channel = of_it[preferred([(c.kind, len(c.stamps)) for _, c in of_it])]
+            stamps = CameraStamps(channel.t_ns(), np.array(channel.marks, dtype=np.int64))
             wanted, reader = stamps.wanted, PointReader(channel.kind)
             for raw in self._dated() if wanted else ():
                 stamp_ns = stamp_of(raw.payload) if raw.topic == topic else None
-                if stamp_ns in wanted:
+                if stamp_ns is not None and stamp_ns in wanted:
                     stamps.take(stamp_ns, reader.read(raw.payload))
             even = stamps.even()
             if even is not None:
@@ -306,8 +306,8 @@ class LogRecording(Recording):
                 for _, c in of_it:
                     c.even_ns = np.array([better.get(t, t) for t in c.stamps], dtype=np.int64)
 
-    def _stream(self, topic: str, channel: _Channel) -> Stream:
-        stamps = np.sort(_stamps(channel))
+    def _stream(self, topic: str, channel: Channel) -> Stream:
+        stamps = np.sort(channel.t_ns())
         statistics = stream_statistics(stamps)
         return Stream(channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution)
 
@@ -326,21 +326,22 @@ class LogRecording(Recording):
             yield item.key, item.payload
 
     def _stamped(self, keys: set[str]) -> Iterator[Stamped]:
-        rows = dict.fromkeys(self._channels, 0)
+        used = {t: UsedMessages(c) for t, c in self._channels.items() if not c.as_it_is}
         wanted = {topic: (c.key, c.kind == "imu") for topic, c in self._channels.items() if c.key in keys}
         wanted |= {topic: (key, False) for topic, key in self._statuses.items() if key in keys}
         for raw in self._dated():
             if raw.topic not in wanted:
                 continue
-            stamp_ns = stamp_of(raw.payload)
-            if stamp_ns is None:
-                continue
             payload, channel = raw.payload, self._channels.get(raw.topic)
-            if channel is not None and (channel.even_ns is not None or channel.forces is not None):
-                if channel.kind == "imu" and not _has_imu_size(payload):
+            if channel is None or raw.topic not in used:
+                stamp_ns = stamp_of(payload)
+                if stamp_ns is None:
                     continue
-                row = rows[raw.topic]
-                rows[raw.topic] += 1
+            else:
+                taken = used[raw.topic].take(payload)
+                if taken is None:
+                    continue
+                stamp_ns, row = taken
                 if channel.even_ns is not None:
                     stamp_ns = int(channel.even_ns[row])
                     payload = with_stamp(payload, stamp_ns)
@@ -353,75 +354,16 @@ class LogRecording(Recording):
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`; malformed messages are skipped."""
         channel = next(c for c in self._channels.values() if c.kind == "imu" and c.name == name)
-        t_ns, values = _stamps(channel), _values(channel)
+        t_ns, values = channel.t_ns(), channel.imu_values()
         good = np.isfinite(values).all(axis=1)
         order = np.argsort(t_ns[good], kind="stable")
         values = values[good][order]
         return ImuArrays(t_ns[good][order], values[:, :3].copy(), values[:, 3:].copy())
 
 
-def _stamps(channel: _Channel) -> IntArray:
-    return np.array(channel.stamps, dtype=np.int64) if channel.even_ns is None else channel.even_ns
-
-
-def _values(channel: _Channel) -> FloatArray:
-    """Rates and forces of an imu, in the order of the log; shape (n, 6)."""
-    values: FloatArray = np.frombuffer(bytes(channel.values), dtype="<f8").reshape(-1, 6)
-    return values
-
-
-def stamp_of(payload: bytes) -> int | None:
-    """Return the stamp of a message that begins with a Header; None if these bytes hold none."""
-    if len(payload) < 12 or payload[:2] != b"\x00\x01":
-        return None
-    seconds, nanoseconds = _STAMP.unpack_from(payload, 4)
-    if nanoseconds >= 1_000_000_000:
-        return None
-    stamp_ns: int = seconds * 1_000_000_000 + nanoseconds
-    return stamp_ns
-
-
-def with_stamp(payload: bytes, stamp_ns: int) -> bytes:
-    """Return a message for which `stamp_of` gives a stamp, with another one."""
-    return payload[:4] + _STAMP.pack(*divmod(stamp_ns, 1_000_000_000)) + payload[12:]
-
-
-def force_of(payload: bytes) -> bytes:
-    """Return the specific force of a sensor_msgs/Imu as it is written."""
-    return payload[_FORCE]
-
-
-def with_force(payload: bytes, force: bytes) -> bytes:
-    """Return a sensor_msgs/Imu with another specific force, see `force_of`."""
-    return payload[: _FORCE.start] + force + payload[_FORCE.stop :]
-
-
-def _has_imu_size(payload: bytes) -> bool:
-    """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
-    if len(payload) < 16 + _IMU_NUMBERS:
-        return False
-    behind_name = 12 + int.from_bytes(payload[12:16], "little")  # counted from behind the encapsulation
-    return len(payload) == 4 + behind_name + (-behind_name) % 8 + _IMU_NUMBERS
-
-
-def _readable(channel: _Channel, payload: bytes) -> bool:
-    """Try the first message of a topic, and learn the size of the images from it."""
-    try:
-        if channel.kind == "imu":
-            decode_imu(payload)
-        elif channel.kind == "image":
-            image = decode_image(payload)
-            image.pixels()
-            channel.resolution = (image.width, image.height)
-        elif channel.kind == "compressed":
-            channel.resolution = encoded_size(decode_compressed_image(payload).data)
-        elif channel.kind in ("points", "tracks"):
-            size = decode_points(payload).image_size
-            channel.resolution = size if all(size) else None
-    except MessageError as error:
-        channel.problem = channel.problem or str(error)
-        return False
-    return True
+def _with_frame(topic: str, frame: bytes) -> str:
+    """Name a part of a topic: the messages with one frame_id."""
+    return f"{topic} ({frame.rstrip(bytes(1)).decode('utf-8', 'replace')})"
 
 
 def _shows_depth(raw: RawMessage) -> bool:

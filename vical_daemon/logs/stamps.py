@@ -15,6 +15,12 @@ UNIT_WORDS = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "
 _NAMED = {"ns": "ns", "nsec": "ns", "us": "us", "µs": "us", "usec": "us", "ms": "ms", "msec": "ms"}
 _NAMED |= {"s": "s", "sec": "s"} | {word: unit for unit, word in UNIT_WORDS.items()}
 _LATEST_NS = 4_102_444_800 * FACTOR_NS["s"]  # the year 2100: no stamp lies behind it
+_APART_NS = 600 * FACTOR_NS["s"]
+"""From the other stamps of a recording: ten minutes, longer than anyone rests within one."""
+_NEIGHBOURS = 5  # messages on either side of a step
+_BACK_S = 1.0  # more than any buffer delays a message of one sensor
+_FEW = 0.05
+"""Share of the messages that may lie so far away and be mistakes: the first 3 s of a minute."""
 
 
 class StampError(ValueError):
@@ -125,3 +131,44 @@ def unit_by_spacing(
     latest = max(abs(ordered[0]), abs(ordered[-1]))
     possible = [unit for unit, factor in FACTOR_NS.items() if latest * factor <= _LATEST_NS] or ["ns"]
     return min(possible, key=lambda unit: abs(np.log(step_ns * FACTOR_NS[unit] * usual_hz * 1e-9)))
+
+
+def main_stretch(t_ns: IntArray) -> tuple[int, int] | None:
+    """Return first and last stamp of a recording of which a few stamps lie far away; None: there are none.
+
+    Drivers send their first messages with stamp 0, or before the computer's clock was set.
+
+    >>> main_stretch(np.array([0, *range(10**18, 10**18 + 99)])) == (10**18, 10**18 + 98)
+    True
+    """
+    if not len(t_ns):
+        return None
+    ordered = np.sort(t_ns)
+    ends = np.flatnonzero(np.diff(ordered) > _APART_NS) + 1
+    begins = np.concatenate([[0], ends])
+    lengths = np.diff(np.append(begins, len(ordered)))
+    largest = int(np.argmax(lengths))
+    if len(lengths) == 1 or lengths[largest] < (1.0 - _FEW) * len(ordered):
+        return None
+    begin = int(begins[largest])
+    return int(ordered[begin]), int(ordered[begin + int(lengths[largest]) - 1])
+
+
+def set_back_s(t_ns: IntArray) -> float:
+    """Return by how much a clock was set back while it stamped these messages, in the order of the log, s.
+
+    0: it was not. Some messages of another order, or with wrong stamps, do not count, and neither do copies.
+
+    >>> set_back_s(np.array([*range(20), *range(-5, 15)]) * 10**9)
+    20.0
+    >>> set_back_s(np.array([*range(20), 10**6, *range(21, 40)]) * 10**9)
+    0.0
+    """
+    if len(t_ns) < 2 * _NEIGHBOURS:
+        return 0.0
+    at = int(np.argmin(np.diff(t_ns))) + 1
+    if t_ns[at] == t_ns[0]:
+        return 0.0  # a copy
+    before, after = t_ns[max(at - _NEIGHBOURS, 0) : at], t_ns[at : at + _NEIGHBOURS]
+    back_s = float(np.median(before) - np.median(after)) * 1e-9
+    return back_s if min(len(before), len(after)) == _NEIGHBOURS and back_s > _BACK_S else 0.0

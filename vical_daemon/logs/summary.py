@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogReader
 from vical_daemon.logs.model import Recording
-from vical_daemon.logs.recorded_logs import LogRecording, stamp_of
+from vical_daemon.logs.recorded_logs import LogRecording
 
 _PERIODIC_HZ = 0.5
 _SAME_CLOCK_MS = 3_600_000.0

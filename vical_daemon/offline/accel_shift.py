@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from vical_daemon.logs.recorded_logs import force_of, stamp_of, with_force
+from vical_daemon.logs.channel import force_of, stamp_of, with_force
 
 STRAIGHT_S = 3e-3
 """Up to this lag, s, the first order will do: (2 pi 3 Hz * 3 ms)**2 / 2 = 0.2 %."""

@@ -18,7 +18,7 @@ from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.worker import EstimateRole
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
+from vical_daemon.logs.channel import stamp_of, with_stamp
 from vical_daemon.offline.accel_shift import STRAIGHT_S
 from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
 from vical_daemon.offline.trace import Trace
@@ -133,7 +133,10 @@ def run_job(
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
     wrong = "; ".join(f"{d.camera}: {d.wrong_target}" for d in player.detectors if d.wrong_target)
-    left_out = estimator.left_out | {"images_of_another_size": sum(d.refused for d in player.detectors)}
+    left_out = estimator.left_out | {
+        "images_of_another_size": sum(d.refused for d in player.detectors),
+        "images_unreadable": sum(d.malformed for d in player.detectors),
+    }
     return Outcome(
         replace(role.latest, events=player.events), player.trace.points, frames, used, checks, left_out, wrong
     )

@@ -12,7 +12,7 @@ from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, I
 from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.errors import InputError, OptionError, size_unknown
 

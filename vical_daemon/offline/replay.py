@@ -9,7 +9,7 @@ from collections.abc import Callable
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.topics import STATUS, check_name
 from vical_daemon.logs import Recording
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.channel import stamp_of
 
 _PROGRESS_S = 1.0
 

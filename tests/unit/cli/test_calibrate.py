@@ -21,8 +21,8 @@ from vical_daemon.cli import calibration_text, main
 from vical_daemon.config.priors import read_initial
 from vical_daemon.estimation.result import Status
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
 from vical_daemon.offline.calibration_job import make_job
 

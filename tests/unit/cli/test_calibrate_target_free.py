@@ -98,3 +98,12 @@ def test_the_size_of_no_target_is_refused(stereo, capsys: pytest.CaptureFixture[
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines()[-1] == "vical: error: without a target there is no target_scale to estimate"
+
+
+def test_a_camera_too_slow_to_follow_features_is_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = simulate_tracks(12, 8.0, rig=reference_rig(12), camera_rate_hz=1.0)
+    assert _calibrate(_write(tmp_path, {"cam0": run})) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "cam0: its images come at 1 Hz" in said and "5 Hz are needed" in said and "--target" in said

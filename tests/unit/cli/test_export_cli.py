@@ -217,6 +217,26 @@ def test_csv_mistakes(tmp_path, capsys, text, says):
     assert len(error.splitlines()) == 1
 
 
+def test_a_csv_is_read_by_its_title(tmp_path, capsys):
+    """At rest, nothing but the title tells deg/s from rad/s: all densities would be 57 times too large."""
+    rows = np.tile([0.0, 0.0, 9.8, 0.0, 0.0, 0.0], (2000, 1))
+    rows += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).standard_normal((2000, 6))
+    path = tmp_path / "x.csv"
+
+    def allan(title):
+        text = (f"{k},{10**18 + k * 10**7}," + ",".join(map(str, row)) for k, row in enumerate(rows))
+        path.write_text("\n".join([title, *text]))
+        code = main(["allan", str(path), "--json", "--quiet"])
+        return code, *capsys.readouterr()
+
+    code, out, _ = allan("count,stamp,acc_x,acc_y,acc_z,gyro_x [rad/s],gyro_y,gyro_z")
+    found = json.loads(out)["imu_noise"]
+    assert code == 0 and found["gyro_density"] == pytest.approx(1e-4, rel=0.2)
+    assert found["accel_density"] == pytest.approx(1e-3, rel=0.2)
+    code, _, error = allan("count,stamp,acc_x,acc_y,acc_z,gyro_x [deg/s],gyro_y,gyro_z")
+    assert code == 1 and "gives the gyro in degrees" in error and "multiply by pi/180" in error
+
+
 def test_units_and_motion_are_noticed(tmp_path, capsys):
     rng = np.random.default_rng(0)
     path = tmp_path / "x.csv"

@@ -9,8 +9,8 @@ import pytest
 from vical_daemon.bus.messages import encode_string
 from vical_daemon.cli import main
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogFolder, LogReader, LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 
 
 @pytest.fixture

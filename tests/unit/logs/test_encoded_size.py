@@ -10,9 +10,9 @@ import pytest
 
 from vical_daemon.bus.messages import decode_compressed_image, encode_compressed_image, encode_imu
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.vision.image_codec import decode_image
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8)

@@ -8,9 +8,9 @@ import pytest
 
 from vical_daemon.bus.messages import encode_image, encode_imu, encode_points
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, even_grid, mark_of
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 
 RATE_HZ = 20.0
 COUNT = 800

@@ -9,9 +9,9 @@ import pytest
 
 from vical_daemon.bus.messages import decode_imu
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 
 RATE_HZ = 200.0
 COUNT = 12_000

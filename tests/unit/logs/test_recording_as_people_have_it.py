@@ -17,8 +17,8 @@ from vical_daemon.bus.messages import POINTS_TYPE, encode_compressed_image, enco
 from vical_daemon.bus.messages.schemas import DEFINITIONS
 from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.channel import stamp_of, with_stamp
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
 from vical_daemon.offline.calibration_job import make_job
 from vical_daemon.offline.errors import InputError
 
@@ -71,29 +71,96 @@ def test_a_last_line_that_was_cut_off_is_left_out_and_counted(tmp_path, write_as
         open_recording(folder)
 
 
+_GYRO_LAST = [0, 4, 5, 6, 1, 2, 3]
+
+
 @pytest.mark.parametrize(
-    ("title", "refused"),
+    ("title", "order"),
     [
-        ("#timestamp [ns],a_RS_S_x [m s^-2],a_y,a_z,w_RS_S_x [rad s^-1],w_y,w_z", True),
-        ("timestamp,accel_x,accel_y,accel_z,gyro_x,gyro_y,gyro_z", True),
-        ("t,ax,ay,az,wx,wy,wz", True),
-        ("timestamp,ax,ay,az,gx,gy,gz", True),
+        ("#timestamp [ns],a_RS_S_x [m s^-2],a_y,a_z,w_RS_S_x [rad s^-1],w_y,w_z", _GYRO_LAST),
+        ("timestamp,accel_x,accel_y,accel_z,gyro_x,gyro_y,gyro_z", _GYRO_LAST),
+        ("t,ax,ay,az,wx,wy,wz", _GYRO_LAST),
+        ("timestamp,ax,ay,az,gx,gy,gz", _GYRO_LAST),
         ("t,linear_acceleration.x,linear_acceleration.y,linear_acceleration.z,angular_velocity.x,"
-         "angular_velocity.y,angular_velocity.z", True),
-        ("#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z", False),
+         "angular_velocity.y,angular_velocity.z", _GYRO_LAST),
+        ("#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z", range(7)),
         ("t,angular_velocity.x,angular_velocity.y,angular_velocity.z,linear_acceleration.x,"
-         "linear_acceleration.y,linear_acceleration.z", False),
+         "linear_acceleration.y,linear_acceleration.z", range(7)),
+        ("t,gyro_z,accel_z,gyro_y,accel_y,gyro_x,accel_x", [0, 3, 6, 2, 5, 1, 4]),
     ],
 )  # fmt: skip
-def test_a_title_that_names_the_accelerometer_first_is_believed(tmp_path, write_asl, title, refused):
+def test_a_title_that_names_the_axes_is_believed(tmp_path, write_asl, title, order):
+    folder = write_asl(tmp_path / "a")
+    before = open_recording(folder).imu_arrays("imu0")
+    path = folder / "mav0/imu0/data.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    path.write_text("\n".join([title, *(",".join(row[i] for i in order) for row in rows)]) + "\n")
+    recording = open_recording(folder)
+    after = recording.imu_arrays("imu0")
+    assert after.t_ns.tolist() == before.t_ns.tolist()
+    assert after.gyro_rps.tolist() == before.gyro_rps.tolist()
+    assert after.specific_force_mps2.tolist() == before.specific_force_mps2.tolist()
+    assert any("read by their names" in text for text in recording.warnings) == (list(order) != [*range(7)])
+
+
+@pytest.mark.parametrize(
+    ("title", "row"),
+    [
+        ("id,timestamp,wx,wy,wz,ax,ay,az", "{i},{t},{six}"),
+        ("%time,field.header.seq,field.header.stamp,field.header.frame_id,field.orientation.x,"
+         "field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
+         "field.angular_velocity_covariance0,field.linear_acceleration.x,field.linear_acceleration.y,"
+         "field.linear_acceleration.z", "{late},{i},{t},imu,0.5,{w},0,{a}"),
+        ("Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id,angular_velocity.x,"
+         "angular_velocity.y,angular_velocity.z,linear_acceleration.x,linear_acceleration.y,"
+         "linear_acceleration.z", "{late},{i},{s},{ns},imu,{six}"),
+    ],
+    ids=["counter first", "rostopic echo -p", "bagpy"],
+)  # fmt: skip
+def test_other_columns_may_stand_between_if_the_title_names_all(tmp_path, write_asl, title, row):
+    folder = write_asl(tmp_path / "a")
+    before = open_recording(folder).imu_arrays("imu0")
+    path = folder / "mav0/imu0/data.csv"
+    lines = [title]
+    for i, line in enumerate(path.read_text().splitlines()[1:]):
+        t, *six = line.split(",")
+        cells = {"w": ",".join(six[:3]), "a": ",".join(six[3:]), "six": ",".join(six), "i": i, "t": t}
+        s, ns = divmod(int(t), 10**9)
+        lines.append(row.format(**cells, late=int(t) + 7_000_000, s=s, ns=ns))
+    path.write_text("\n".join(lines) + "\n" + lines[-1][:40])
+    recording = open_recording(folder)
+    after = recording.imu_arrays("imu0")
+    assert after.t_ns.tolist() == before.t_ns.tolist()
+    assert after.gyro_rps.tolist() == before.gyro_rps.tolist()
+    assert after.specific_force_mps2.tolist() == before.specific_force_mps2.tolist()
+    assert any("the last line of data.csv is cut off" in text for text in recording.warnings)
+
+
+def test_a_gyro_in_degrees_by_its_title_is_refused(tmp_path, write_asl):
     folder = write_asl(tmp_path / "a")
     path = folder / "mav0/imu0/data.csv"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([title, *(lines[1:] if lines[0].startswith("#") else lines)]) + "\n")
-    if not refused:
-        assert open_recording(folder).imu_samples > 0
-        return
-    with pytest.raises(RecordingError, match=r"accelerometer before the gyro.*swap the columns"):
+    path.write_text(path.read_text().replace("w_x,w_y,w_z", "w_x [deg s^-1],w_y,w_z"))
+    with pytest.raises(RecordingError, match="title gives the gyro in degrees; rad/s are expected"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize(
+    ("before", "says"),
+    [
+        ("{i},", "are these its columns"),
+        ("{t},0.1,0.2,0.3,0.927,", "stands a quaternion: leave the orientations out"),
+    ],
+)
+def test_columns_before_the_gyro_without_a_title_are_named(tmp_path, write_asl, before, says):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    lines = path.read_text().splitlines()[1:]
+    lines = [
+        before.format(i=i, t=line.split(",")[0]) + (line if "i" in before else line.split(",", 1)[1])
+        for i, line in enumerate(lines)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match=says):
         open_recording(folder)
 
 

@@ -11,8 +11,8 @@ import pytest
 from vical_daemon.bus import messages as m
 from vical_daemon.cli import main
 from vical_daemon.logs import open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogReader, LogWriter, segments_in
-from vical_daemon.logs.recorded_logs import stamp_of
 
 IMU = "vical/rig0/imu/imu0"
 BEGIN_NS = 1_700_000_000_000_000_000

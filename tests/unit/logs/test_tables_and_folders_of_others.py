@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.recorded_logs import stamp_of
 
 
 @pytest.fixture

@@ -6,14 +6,18 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from vical_daemon.bus.messages import COMPRESSED_IMAGE_TYPE, encode_compressed_image
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.cli import calibration_text
-from vical_daemon.config.priors import read_initial
+from vical_daemon.config.priors import Initial, read_initial
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.logs import Stream, open_recording
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.channel import stamp_of
+from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.offline import calibrate
 from vical_daemon.offline.calibration_job import make_job, suspects
 from vical_daemon.offline.errors import InputError, size_unknown
@@ -147,3 +151,25 @@ def test_an_image_size_that_is_not_known_is_told_with_the_reason(kind: str, says
     """A bag of H.264 images: only the size was asked for, and with it no image was read."""
     text = size_unknown(Stream("k", kind, "cam0", "", 9, 0, 1, 10.0, 0.1))
     assert says in text and "`cam0: {resolution: [width, height]}`" in text
+
+
+def test_images_that_cannot_be_read_are_counted(shortest: Path, tmp_path: Path) -> None:
+    whole = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
+    source = open_recording(shortest)
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for n, (key, payload) in enumerate(source.messages(source.imus.values())):
+            stamp_ns = stamp_of(payload) or 0
+            writer.write(key, payload, stamp_ns)
+            if n % 20 == 0:
+                data = whole if n % 100 else whole[:40]
+                image = encode_compressed_image(stamp_ns, "cam0", "png", data)
+                writer.write(
+                    "vical/rig0/camera/cam0/image/compressed", image, stamp_ns, COMPRESSED_IMAGE_TYPE
+                )
+    recording = open_recording(tmp_path / "a.mcap")
+    job = make_job(recording, Initial(), target=str(shortest / "target.yaml"))
+    outcome = calibrate.run_job(job, lambda share, estimate: None)
+    broken = -(-recording.imu_samples // 100)
+    assert outcome.left_out["images_unreadable"] == broken
+    text = calibration_text.describe(calibrate.document(job, outcome))
+    assert f"{broken} images unreadable" in text

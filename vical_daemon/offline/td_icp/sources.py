@@ -165,7 +165,7 @@ def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> li
     frames, unreadable = [], 0
     for _, payload in recording.messages([stream]):
         try:
-            stamp_ns, image = _image(payload, stream.kind)
+            stamp_ns, image = image_of(payload, stream.kind)
         except ValueError:  # damaged, or larger than an image can be: as the service, which counts them
             unreadable += 1
             continue
@@ -177,7 +177,8 @@ def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> li
     return frames
 
 
-def _image(payload: bytes, kind: str) -> tuple[int, Any]:
+def image_of(payload: bytes, kind: str) -> tuple[int, Any]:
+    """Return the stamp, ns, and the pixels of an image message of a kind (image or compressed)."""
     from vical_daemon.bus.messages import decode_compressed_image, decode_image
 
     if kind == "image":

@@ -1,0 +1,155 @@
+"""The images of one camera of an ASL/EuRoC folder: which there are, their stamps and their size."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from vical_drivers.user_files import open_file, read_text
+
+from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
+from vical_daemon.logs.asl_tables import read_table
+from vical_daemon.logs.encoded_size import HEAD, encoded_size
+from vical_daemon.logs.model import RecordingError
+
+IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"} | {
+    f".{kind}": kind for kind in ("pgm", "ppm", "bmp")
+}
+_OTHER_SUFFIXES = {".tif", ".tiff", ".webp", ".gif", ".jp2", ".exr", ".heic", ".raw", ".npy"}
+_NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
+_STAMP_DIGITS = 13
+"""Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
+_MOST = 0.9  # share of the names that are stamps; the others do not belong to the recording
+_TIMES = ("times.txt", "timestamps.txt")
+_TRIED = 50  # images whose size is looked for: the first may be damaged
+
+
+class Images(NamedTuple):
+    """Images of one camera.
+
+    Attributes:
+        stamps: Of each, as text.
+        files: Of each.
+        warnings: What was left out and why, one line each, without the name of the camera.
+    """
+
+    stamps: list[str]
+    files: list[Path]
+    warnings: list[str]
+
+
+def image_list(table: Path, folder: Path) -> Images:
+    """Return the images that ``data.csv`` lists; names cannot leave the folder.
+
+    Raises:
+        RecordingError: The table is wrong, or none of the images is there.
+    """
+    stamps: list[str] = []
+    files, lost = [], []
+    for number, line in enumerate(read_table(table).decode("utf-8", "replace").splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        stamp, _, name = (part.strip() for part in line.partition(","))
+        name = name.split(",")[0].strip() or stamp
+        if not _NUMBER.fullmatch(stamp) or ".." in Path(name).parts or Path(name).is_absolute():
+            raise RecordingError(
+                f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
+            )
+        path = _find(folder, Path(name).name)
+        if path is None:
+            lost.append(name)
+            continue
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            raise RecordingError(f"{path}: images must be png, jpg, pgm, ppm or bmp")
+        stamps.append(stamp)
+        files.append(path)
+    if lost and not stamps:
+        raise RecordingError(f"{table}: there is no image {lost[0]} next to it, nor any other listed")
+    warnings = [f"{len(lost)} images listed but not there, first {lost[0]}"] if lost else []
+    return Images(stamps, files, warnings)
+
+
+def _find(folder: Path, name: str) -> Path | None:
+    """Return the file of an image that a table names, with or without its ending."""
+    names = [name, f"{name}.png", f"{name}.jpg"]
+    return next((p for n in names for p in (folder / "data" / n, folder / n) if p.is_file()), None)
+
+
+def images_by_name(folder: Path) -> Images:
+    """Return the images of a folder without ``data.csv``; none where they have no stamps.
+
+    Kalibr's `kalibr_bagcreater` reads such folders (ns); names like ``1305031102.175304`` are seconds.
+    Images that are merely numbered have their stamps in ``times.txt``, a line for each, or none.
+    """
+    images = _in_order(folder, set(IMAGE_SUFFIXES))
+    stamped = [path for path in images if _is_stamp(path.stem)]
+    if images and len(stamped) >= _MOST * len(images):
+        rest = [path.name for path in images if not _is_stamp(path.stem)]
+        text = f"{len(rest)} images left out, whose names are no stamps, first {rest[:1]}"
+        return Images([path.stem for path in stamped], stamped, [text] if rest else [])
+    stamps = _times_of(folder, images)
+    if stamps or not images:
+        unread = _in_order(folder, _OTHER_SUFFIXES)
+        text = f"{len(unread)} unreadable images, like {{}}: only png, jpg, pgm, ppm and bmp are read"
+        return Images(stamps, images, [text.format(unread[0].name)] if unread and not images else [])
+    other = next(path for path in images if path not in stamped)
+    text = (
+        f"{len(images)} images have no stamps: there is no data.csv, nor a times.txt with as many lines, and "
+        f"names like {other.name} are no times in ns"
+    )
+    return Images([], images, [text])
+
+
+def _times_of(folder: Path, images: list[Path]) -> list[str]:
+    """Return the stamps of a file with a line for each image, `[name] stamp ...`; [] if there is none."""
+    places = (folder, folder / "data", folder.parent)
+    path = next((p for place in places for p in (place / name for name in _TIMES) if p.is_file()), None)
+    if path is None:
+        return []
+    rows = [
+        line.replace(",", " ").split() for line in read_table(path).decode("utf-8", "replace").splitlines()
+    ]
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    if len(rows) != len(images):
+        return []
+    named = all(len(row) > 1 and Path(row[0]).stem == p.stem for row, p in zip(rows, images, strict=True))
+    stamps = [row[1 if named else 0] for row in rows]
+    return stamps if all(_NUMBER.fullmatch(stamp) for stamp in stamps) else []
+
+
+def _in_order(folder: Path, suffixes: set[str]) -> list[Path]:
+    """Return the files with these endings; hidden ones are those of an archive of macOS."""
+    places = [place for place in (folder / "data", folder) if place.is_dir()]
+    files = [path for place in places for path in sorted(place.iterdir(), key=_counted)]
+    return [p for p in files if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+
+
+def _counted(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts 2.png before 10.png."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _is_stamp(name: str) -> bool:
+    return len(name) >= _STAMP_DIGITS and re.fullmatch(r"[0-9]+(\.[0-9]+)?", name) is not None
+
+
+def image_size(folder: Path) -> tuple[int, int] | None:
+    """Return the size of the images from ``sensor.yaml`` or the first image that has one."""
+    sensor = folder / "sensor.yaml"
+    if sensor.is_file():
+        import yaml
+
+        try:
+            text = read_text(sensor, MAX_BYTES)
+            refuse_hostile(text, sensor.name)
+            size = yaml.safe_load(text)["resolution"]
+            return int(size[0]), int(size[1])
+        except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
+            pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
+    for path in _in_order(folder, set(IMAGE_SUFFIXES))[:_TRIED]:
+        with open_file(path) as file:
+            found = encoded_size(file.read(HEAD))
+        if found is not None:
+            return found
+    return None
