@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -24,12 +25,41 @@ _RETRY_S = 0.5
 _QUIET_S = 2.0
 
 
+class HostedSocket:
+    """The socket of the bus that this process hosts: without it nobody can join, also none that restarts.
+
+    It is removed with the folder of a login session that ended (`XDG_RUNTIME_DIR`), or by a cleaner of /tmp.
+
+    Args:
+        path: Where it is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._said = path, False
+        self._inode = path.stat().st_ino
+
+    def lost(self) -> str:
+        """Say that it was removed, or replaced by another process's, and can be made anew; else ""."""
+        with contextlib.suppress(OSError):
+            if self._path.stat().st_ino == self._inode:
+                return ""
+        text = f"the socket of the bus at {self._path} was removed: no process can join"
+        try:
+            make_private(self._path.parent)
+        except OSError as error:
+            if not self._said:
+                self._said = True
+                _log.error("%s; it cannot be made again (%s)", text, error)
+            return ""
+        return text
+
+
 def socket_path(bus: BusConfig) -> Path:
     """Where the router of a rig listens."""
     return Path(bus.socket) if bus.socket else own_socket()
 
 
-def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> Bus | None:
+def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> ZenohBus | None:
     """Open the bus for a process with these roles: the one that acquires hosts it, others are clients.
 
     A client waits for its router as long as it takes (None when stopped meanwhile): services start
