@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.local_bus import open_local_bus
@@ -38,6 +38,11 @@ class HostedSocket:
         self._path, self._said = path, False
         self._inode = path.stat().st_ino
 
+    @classmethod
+    def of(cls, bus: Bus, config: Config) -> Self | None:
+        """Return the socket of a bus that this process hosts; None: it hosts none."""
+        return cls(socket_path(config.bus)) if isinstance(bus, ZenohBus) and bus.is_router else None
+
     def lost(self) -> str:
         """Say that it was removed, or replaced by another process's, and can be made anew; else ""."""
         with contextlib.suppress(OSError):
@@ -59,7 +64,7 @@ def socket_path(bus: BusConfig) -> Path:
     return Path(bus.socket) if bus.socket else own_socket()
 
 
-def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> ZenohBus | None:
+def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> Bus | None:
     """Open the bus for a process with these roles: the one that acquires hosts it, others are clients.
 
     A client waits for its router as long as it takes (None when stopped meanwhile): services start

@@ -93,7 +93,7 @@ def _claims(config: Config, roles: list[str], stop: threading.Event) -> Claims:
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
-    from vical_daemon.cli.bus_access import HostedSocket, open_for_roles, socket_path
+    from vical_daemon.cli.bus_access import HostedSocket, open_for_roles
     from vical_daemon.cli.emulated import emulated_devices
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.service import notify
@@ -101,7 +101,7 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # stopped while waiting for the router
         return 0
-    hosted = HostedSocket(socket_path(config.bus)) if bus.is_router else None
+    hosted = HostedSocket.of(bus, config)
     try:
         with _claims(config, roles, stop), emulated_devices(config, roles) as options:
             notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
