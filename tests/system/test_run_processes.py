@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -149,6 +150,24 @@ def test_a_second_host_of_the_bus_is_one_line(daemon: Daemon) -> None:
     _, err = second.communicate(timeout=60)
     assert second.returncode == 1 and "already hosts the bus" in err.splitlines()[-1]
     assert first.poll() is None
+
+
+def test_a_host_whose_socket_was_removed_starts_again(daemon: Daemon) -> None:
+    """With its login session the folder of a laptop's service went: no process that restarted could join."""
+    first = daemon.vical("run", "acquire")
+    _wait_for(daemon.socket.exists)
+    bus = open_bus(mode="client", socket=daemon.socket)
+    got: list[Sample] = []
+    bus.subscribe("vical/rover/imu/imu0", got.append)
+    _wait_for(lambda: got)
+    shutil.rmtree(daemon.socket.parent)
+    _, err = first.communicate(timeout=60)
+    assert first.returncode == 1
+    assert "zenoh.sock was removed: no process can join; starting again" in err.splitlines()[-1]
+    daemon.vical("run", "acquire")  # by systemd, or by `vical run`
+    got.clear()
+    _wait_for(lambda: got)  # a client that was there before joins again
+    bus.close()
 
 
 @pytest.mark.parametrize(

@@ -256,6 +256,11 @@ class ZenohBus:
         return self._session
 
     @property
+    def is_router(self) -> bool:
+        """Whether this process hosts the bus."""
+        return self._is_router
+
+    @property
     def connected(self) -> bool:
         """Whether a client has its router now (it reconnects by itself); always true for a router."""
         return self._is_router or bool(self._session.info.routers_zid())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.local_bus import open_local_bus
@@ -22,6 +23,40 @@ _log = logging.getLogger(__name__)
 _HOSTS = {"imu", "camera"}
 _RETRY_S = 0.5
 _QUIET_S = 2.0
+
+
+class HostedSocket:
+    """The socket of the bus that this process hosts: without it nobody can join, also none that restarts.
+
+    It is removed with the folder of a login session that ended (`XDG_RUNTIME_DIR`), or by a cleaner of /tmp.
+
+    Args:
+        path: Where it is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._said = path, False
+        self._inode = path.stat().st_ino
+
+    @classmethod
+    def of(cls, bus: Bus, config: Config) -> Self | None:
+        """Return the socket of a bus that this process hosts; None: it hosts none."""
+        return cls(socket_path(config.bus)) if isinstance(bus, ZenohBus) and bus.is_router else None
+
+    def lost(self) -> str:
+        """Say that it was removed, or replaced by another process's, and can be made anew; else ""."""
+        with contextlib.suppress(OSError):
+            if self._path.stat().st_ino == self._inode:
+                return ""
+        text = f"the socket of the bus at {self._path} was removed: no process can join"
+        try:
+            make_private(self._path.parent)
+        except OSError as error:
+            if not self._said:
+                self._said = True
+                _log.error("%s; it cannot be made again (%s)", text, error)
+            return ""
+        return text
 
 
 def socket_path(bus: BusConfig) -> Path:

@@ -20,6 +20,7 @@ from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
 if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus
+    from vical_daemon.cli.bus_access import HostedSocket
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.config.model import Config
     from vical_daemon.service.claims import Claims
@@ -92,7 +93,7 @@ def _claims(config: Config, roles: list[str], stop: threading.Event) -> Claims:
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
-    from vical_daemon.cli.bus_access import open_for_roles
+    from vical_daemon.cli.bus_access import HostedSocket, open_for_roles
     from vical_daemon.cli.emulated import emulated_devices
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.service import notify
@@ -100,6 +101,7 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # stopped while waiting for the router
         return 0
+    hosted = HostedSocket.of(bus, config)
     try:
         with _claims(config, roles, stop), emulated_devices(config, roles) as options:
             notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
@@ -107,7 +109,7 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
             try:
                 for role in reversed(roles):
                     threads.start(role, options.get(role))
-                _attend(config, bus, roles, threads, stop)
+                _attend(config, bus, roles, threads, stop, hosted)
             finally:
                 clean = threads.stop_all()
     finally:
@@ -116,8 +118,15 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     return 0 if clean else 1
 
 
-def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, stop: threading.Event) -> None:
-    """Tell systemd how it goes, once a second, until the end."""
+def _attend(
+    config: Config, bus: Bus, roles: list[str], threads: RoleThreads, stop: threading.Event,
+    hosted: HostedSocket | None,
+) -> None:  # fmt: skip
+    """Tell systemd how it goes, once a second, until the end.
+
+    Raises:
+        CliError: The socket of the bus is gone; a new process makes it again.
+    """
     from vical_daemon.bus import topics
     from vical_daemon.service import notify
     from vical_daemon.service.liveness import Liveness
@@ -144,6 +153,8 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
                 f"not alive: {problem}" if said else "alive again",
             )
         notify.status(problem or liveness.summary())
+        if hosted is not None and (gone := hosted.lost()):
+            raise CliError(f"{gone}; starting again")
     notify.stopping()
 
 

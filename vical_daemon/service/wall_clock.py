@@ -21,7 +21,13 @@ from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.service.atomic_file import atomic_write
 
 FILE_NAME = "wall_clock.json"
+_END_NS = 2**31 * 1_000_000_000
+"""Where the stamps of ROS 2 end, UNIX time in ns: their seconds are of 32 bits, with a sign."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class WallClockError(Exception):
+    """The computer's date is none that a stamp can have; one line with a remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +72,18 @@ def measure_offset_ns() -> int:
 
 
 def private_clock() -> WallClock:
-    """Return a clock for a single process (demo, tests)."""
-    return WallClock(measure_offset_ns(), boot_id())
+    """Return a clock for a single process (demo, tests).
+
+    Raises:
+        WallClockError: The computer's date is wrong by decades.
+    """
+    clock = WallClock(measure_offset_ns(), boot_id())
+    if not _holds(clock):
+        date = time.strftime("%Y-%m-%d", time.gmtime(clock.now_ns() * 1e-9))
+        raise WallClockError(
+            f"the computer's date is {date}, and stamps of ROS 2 end on 2038-01-19; set it: timedatectl"
+        )
+    return clock
 
 
 def service_clock() -> WallClock:
@@ -82,14 +98,17 @@ def shared_clock(folder: Path) -> WallClock:
 
     Args:
         folder: The runtime directory.
+
+    Raises:
+        WallClockError: See `private_clock`.
     """
     path = folder / FILE_NAME
     clock = _read(path)
-    if clock is not None and clock.boot_id == boot_id():  # a valid file is never replaced: no lock needed
+    if clock is not None and _holds(clock):  # a valid file is never replaced: no lock needed
         return clock
     with _alone_in(folder):
         clock = _read(path)  # another role may have been faster
-        if clock is None or clock.boot_id != boot_id():
+        if clock is None or not _holds(clock):
             clock = private_clock()
             atomic_write(path, msgspec.json.encode(clock))
     return clock
@@ -112,6 +131,11 @@ def boot_id() -> str:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
         return ""
+
+
+def _holds(clock: WallClock) -> bool:
+    """Whether a clock is of this boot, and its stamps can be written."""
+    return clock.boot_id == boot_id() and 0 <= clock.now_ns() < _END_NS
 
 
 def _read(path: Path) -> WallClock | None:

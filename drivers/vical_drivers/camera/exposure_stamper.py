@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import ExposureStamp, RawStamp, exposure_middle
+
+_CHANGES = 8
+"""Changes that are remembered: automatic exposure makes one an image, and some images wait in the ring."""
 
 
 class ExposureStamper:
@@ -19,8 +24,7 @@ class ExposureStamper:
         assumed = settings.assume_exposure_s
         self._assumed_ns = None if assumed is None else round(assumed * 1e9)
         self._exposure_ns: int | None = None
-        self._before_ns: int | None = None
-        self._changed_ns = 0
+        self._changes: deque[tuple[int, int | None]] = deque(maxlen=_CHANGES)  # when, and what was before
 
     @property
     def exposure_ns(self) -> int | None:
@@ -31,15 +35,17 @@ class ExposureStamper:
         """Take a new exposure; frames that began to expose before `t_set_ns` keep the old one."""
         if exposure_ns == self._exposure_ns:
             return
-        self._before_ns, self._exposure_ns = self.exposure_ns, exposure_ns
-        self._changed_ns = t_set_ns
+        self._changes.append((t_set_ns, self.exposure_ns))
+        self._exposure_ns = exposure_ns
 
     def stamp(self, raw: RawStamp) -> tuple[ExposureStamp, int | None]:
         """Return the stamp of the middle of the exposure, and the exposure it was made with, ns."""
         exposure_ns = self.exposure_ns
         made = self._with(raw, exposure_ns)
-        if exposure_ns is not None and made.t_exposure_mid_ns - exposure_ns // 2 < self._changed_ns:
-            exposure_ns = self._before_ns
+        for changed_ns, before_ns in reversed(self._changes):
+            if exposure_ns is None or made.t_exposure_mid_ns - exposure_ns // 2 >= changed_ns:
+                break
+            exposure_ns = before_ns
             made = self._with(raw, exposure_ns)
         return made, exposure_ns
 

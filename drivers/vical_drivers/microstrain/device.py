@@ -22,6 +22,8 @@ SILENCE_S = 2.0
 """A stream that is silent for this long counts as lost."""
 _ABSENT_S = 0.1
 """A host that is away for longer than this between two reads has not listened: no silence of the device."""
+_LEAST_CONNECTION_S = 1.0
+"""A device whose timer begins anew all the time is set up again this often at most."""
 _BACKOFF_S = (0.1, 0.25)
 """Pauses between attempts to come back: an attempt on a port that is not there costs a system call, one on a
 silent port half a second."""
@@ -125,6 +127,7 @@ class MicrostrainImu(Closing):
         else:
             self._stamper.begin(self.applied, port.wire_byte_ns)
         self._silent_s, self._last_read_s = 0.0, time.monotonic()
+        self._opened_s = self._last_read_s
         self._attempts = 0
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
 
@@ -170,7 +173,15 @@ class MicrostrainImu(Closing):
         if not raw:
             return []
         assert self._stamper is not None
-        return self._stamper.stamp(raw)
+        samples = self._stamper.stamp(raw)
+        if self._stamper.timer_began_anew and self._options.reconnect:
+            # Where it streams from power-up, a device that was reset goes on as its EEPROM says: at another
+            # rate, or with another filter, whose delay would be missing in all stamps.
+            if self._last_read_s - self._opened_s > _LEAST_CONNECTION_S:
+                _log.warning("imu=%s it may have been reset (its timer was): set up again", self._path)
+                self._drop()
+            return []
+        return samples
 
     def _watch_silence(self, *, heard: bool, timeout_s: float) -> None:
         """Add up the time in which the host listened and nothing came."""

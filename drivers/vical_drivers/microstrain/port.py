@@ -246,6 +246,8 @@ def _explain(path: str, error: Exception) -> DriverError:
         return DeviceNotFoundError(f"{path}: no such port; `vical devices` lists those that exist")
     if code in (errno.ENXIO, errno.ENODEV, errno.EIO):
         return DeviceNotFoundError(f"{path}: nothing is connected to this port")
+    if code in (errno.EMFILE, errno.ENFILE):
+        return DriverError(f"{path}: {os.strerror(code)}; see `ulimit -n` of this process")
     if isinstance(error, ValueError):
         return DeviceNotFoundError(f"{path}: the port does not take these settings ({error})")
     return DeviceNotFoundError(f"{path}: this is no serial port; `vical devices` lists those that exist")

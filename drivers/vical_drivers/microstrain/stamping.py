@@ -23,6 +23,8 @@ class SampleStamper:
         clock: The mapping of the present connection.
         samples: Stamped so far.
         lost: Known to be missing so far.
+        timer_began_anew: The device's timer did on this connection, or is sent no more: the device may have
+            been reset.
 
     Args:
         applied: What the device does.
@@ -39,6 +41,7 @@ class SampleStamper:
         self.samples = 0
         self.lost = 0
         self._last_stamp_ns = 0
+        self._restarts = 0
         self._marks: deque[tuple[int, int]] = deque(maxlen=2)  # a stamp, and how many samples there were then
         self.begin(applied, byte_ns)
 
@@ -49,9 +52,10 @@ class SampleStamper:
         self._delay_ns = round(applied.group_delay_s * 1e9 + applied.record_bytes * byte_ns)
         self._span_samples = 0
         self._marks.clear()
+        self.timer_began_anew = False
         # Without a time field the samples themselves are the clock: one tick each.
         self._counter = None if applied.tick_hz else SampleCounter(applied.rate_hz)
-        self._begin_clock(applied.tick_hz or applied.rate_hz, applied.tick_bits, restarts=0)
+        self._begin_clock(applied.tick_hz or applied.rate_hz, applied.tick_bits, restarts=self._restarts)
 
     def _begin_clock(self, tick_hz: float, tick_bits: int | None, restarts: int) -> None:
         self.clock = DeviceClock(tick_hz, tick_bits=tick_bits, rate_hz=self._rate_hz, options=self._options)
@@ -84,6 +88,7 @@ class SampleStamper:
             self._stuck = 0
             if self.clock.restarts != self._restarts:
                 self._restarts, self._warm = self.clock.restarts, False
+                self.timer_began_anew = True
                 self._held.clear()
             self._held.append((sample, device_time))
         if not self._held or not (self._warm or self.clock.age_s >= self._warm_up_s):
@@ -122,6 +127,7 @@ class SampleStamper:
     def _counted(self, t_arrival_ns: int) -> int:
         """Tick of a sample that its device did not date."""
         if self._counter is None:
+            self.timer_began_anew = self.clock.age_s > 0.0
             self._switch_to_counting()
         assert self._counter is not None
         return self._counter.count(t_arrival_ns)

@@ -23,6 +23,7 @@ from vical_drivers.microstrain import device
 from vical_drivers.microstrain.device import open_imu
 from vical_drivers.microstrain.probe import PROBE_BAUDS
 from vical_mocks.faults import ByteFaults
+from vical_mocks.gx3_state import Settings
 
 pytestmark = pytest.mark.system
 FAST = {"warm_up_s": 0.1}
@@ -183,6 +184,26 @@ def test_a_restarted_device_clock_is_noticed(emulate):
         samples = collect(imu, 50)
         assert imu.stats().extra["clock_restarts"] == 1
     assert (np.diff([s.t_host_ns for s in samples]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"protocol": "mip"}, {"eeprom": Settings(power_up_mode=2, preset_command=0xC2)}],
+    ids=["mip", "single-byte"],
+)
+def test_a_device_that_was_reset_gets_its_settings_again(emulate, options):
+    """Its filter was that of the EEPROM from then on: stamps 5 ms off, and half of the samples "lost"."""
+    emulator = emulate(link="uart", **options)
+    with open_imu(emulator.port_name, rate_hz=200.0, filter_width=5, **FAST) as imu:
+        collect(imu, 20)
+        emulator.power_off()
+        emulator.power_on()
+        assert emulator.device.state.settings.taps == 15
+        collect(imu, 200)
+        assert emulator.device.state.settings.taps == imu.applied.filter_width == 5
+        stats = imu.stats()
+        assert (stats.reconnects, stats.extra["clock_restarts"]) == (1, 1.0)
+        assert stats.rate_hz == pytest.approx(200.0, rel=0.01)
 
 
 def test_a_port_without_a_device_and_a_port_in_use(emulate):

@@ -6,12 +6,15 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from vical_daemon.service import wall_clock
 from vical_daemon.service.wall_clock import (
     FILE_NAME,
     WallClock,
+    WallClockError,
+    boot_id,
     measure_offset_ns,
     private_clock,
     shared_clock,
@@ -57,3 +60,18 @@ def test_a_file_of_another_boot_or_a_broken_one_is_replaced(tmp_path: Path, cont
 def test_stamps_of_two_sensors_stay_together() -> None:
     clock = WallClock(1_700_000_000_000_000_000)
     assert clock.unix_ns(2_000) - clock.unix_ns(1_000) == 1_000
+
+
+@pytest.mark.parametrize("year_s", [2_240_000_000, -1_000])
+def test_a_date_that_no_stamp_can_have_is_named_and_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, year_s: int
+) -> None:
+    """It was kept until the next boot, also after NTP had set the clock: the service did not start again."""
+    wrong_ns = year_s * 1_000_000_000 - time.monotonic_ns()
+    with monkeypatch.context() as patched:
+        patched.setattr(wall_clock, "measure_offset_ns", lambda: wrong_ns)
+        with pytest.raises(WallClockError, match=r"date is \d{4}-12-\d\d, .* 2038-01-19; set it"):
+            shared_clock(tmp_path)
+    left = WallClock(wrong_ns, boot_id())
+    (tmp_path / FILE_NAME).write_bytes(msgspec.json.encode(left))  # by an earlier version
+    assert abs(shared_clock(tmp_path).now_ns() - time.time_ns()) < 50_000_000

@@ -249,7 +249,7 @@ function drawSight() {
 function choose(name) {
   page.camera = name;
   selectTab();
-  if (page.views.includes(name)) camera.look(name);
+  camera.look(page.views.includes(name) ? name : null);
 }
 
 function draw() {

@@ -16,19 +16,27 @@ class CameraScreen {
     for (const id of ["show-detected", "show-predicted", "show-coverage"]) this.byId(id).onchange = () => this.draw();
   }
 
-  look(name) {
+  look(name) { // null: this camera sends no pictures here
     if (name === this.name) return;
     this.name = name;
+    this.last = null; // or the picture of another camera would be taken for this one's
+    const canvas = this.byId("picture");
+    canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+    this.byId("corners").replaceChildren();
+    document.querySelector(".screen").classList.remove("live");
+    this.byId("nopicture").textContent = "no image yet";
+    setText("misfit", "");
     this.connect();
   }
 
   connect() {
     const name = this.name;
     if (this.source) this.source.close();
+    if (name === null) return;
     this.source = new EventSource(`camera/${encodeURIComponent(name)}/events`);
     this.source.addEventListener("picture", (event) => {
       this.number += 1;
-      this.show(Object.assign(JSON.parse(event.data), { number: this.number }));
+      this.show(Object.assign(JSON.parse(event.data), { number: this.number, name }));
     });
     this.source.onerror = (event) => {
       document.querySelector(".screen").classList.remove("live");
@@ -46,7 +54,7 @@ class CameraScreen {
         return; // not a picture: the next one comes soon
       }
     }
-    if (this.last && picture.number < this.last.number) return;
+    if (picture.name !== this.name || (this.last && picture.number < this.last.number)) return;
     const canvas = this.byId("picture"); // picture and corners change in one step, never one before the other
     [canvas.width, canvas.height] = picture.jpeg ? [image.naturalWidth, image.naturalHeight] : picture.size;
     if (picture.jpeg) canvas.getContext("2d").drawImage(image, 0, 0); // else only points arrive

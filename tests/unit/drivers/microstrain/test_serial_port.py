@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import termios
 import tty
 
 import pytest
-from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceNotFoundError, DevicePermissionError
+from vical_drivers.errors import (
+    DeviceBusyError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DevicePermissionError,
+    DriverError,
+)
 from vical_drivers.microstrain import port as port_module
 from vical_drivers.microstrain.port import (
     ArrivalLog,
@@ -77,6 +84,17 @@ def test_permission_denied_names_the_group(monkeypatch, tmp_path):
 
     monkeypatch.setattr(port_module.serial, "Serial", refuse)
     with pytest.raises(DevicePermissionError, match=r"permission denied; (it belongs to group|only root)"):
+        SerialPort(str(tmp_path))
+
+
+def test_too_many_open_files_is_no_fault_of_the_port(monkeypatch, tmp_path):
+    """It was 'this is no serial port'."""
+
+    def refuse(*args, **kwargs):
+        raise OSError(errno.EMFILE, "could not open port")
+
+    monkeypatch.setattr(port_module.serial, "Serial", refuse)
+    with pytest.raises(DriverError, match=r"Too many open files; see `ulimit -n`"):
         SerialPort(str(tmp_path))
 
 
