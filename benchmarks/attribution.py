@@ -170,7 +170,7 @@ CASES: dict[str, Case] = {
     "time shift steps by 2 ms": _is(Kind.TIMESHIFT_STEPPED, Kind.CLOCK_WANDER, rig=_stepped, sudden=True),
     "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(gaps.cut, "imu", 0.5)),
     "biases of the imu step by 0.3 deg/s and 0.05 m/s^2": _is(
-        Kind.BIASES_STEPPED, rig=partial(_biases_step, 0.3, 0.05), sudden=True, board_only=True
+        Kind.BIASES_STEPPED, rig=partial(_biases_step, 0.3, 0.05), sudden=True
     ),
     "bump": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 2.0, 0.01), sudden=True),
     "camera moved by 5 mm": _is(*_BUMP, also=_OF_A_BUMP, rig=partial(_bumped, 0.0, 0.005), sudden=True),

@@ -26,12 +26,18 @@ from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
+from vical_daemon.estimation.significance import LIKELY_SIGMAS
 from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit, window_reports
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
-from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, calibration_difference
+from vical_daemon.estimation.smoother.marginal_prior import (
+    BIASES,
+    CORE,
+    MarginalPrior,
+    calibration_difference,
+)
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
@@ -263,7 +269,8 @@ class TargetFreeCalibrator:
             self.evaluator.contradicted(frames[-1][0] - frames[0][0])
         if self.evaluator.against_s > PATIENCE_S:
             return self._all_anew(buffer, frames)
-        return self._after_change(buffer, frames, known) or begun
+        changed = self._after_change(buffer, frames, known)
+        return changed or self._with_new_biases(buffer, frames, known) or begun
 
     def _all_anew(self, buffer: ImuBuffer, frames: list[Stamped]) -> Begun | str:
         """Start a window from nothing: neither another mounting nor another clock explains the images."""
@@ -308,6 +315,24 @@ class TargetFreeCalibrator:
             self.evaluator.stepped(float(change[shift[0]]))
         self._seek_shift = self._confirmed = False
         return ended
+
+    def _with_new_biases(
+        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior
+    ) -> Begun | None:
+        """Start a window that keeps all but the biases, as in another recording; None where it does not fit."""
+        if self.latest is None or self._seek_shift:
+            return None
+        found = self._first.of_another(buffer, frames, known, 0.0)
+        begun = found if isinstance(found, str) else self._first.begin(buffer, frames, found, self._noise)
+        if isinstance(begun, str):
+            return None
+        off = begun.bundle.window.bias[0] - known.bias
+        sigmas = np.sqrt(np.diag(begun.fit.carry.covariance() + known.covariance())[BIASES])
+        if not (np.abs(off) > LIKELY_SIGMAS * sigmas).any():
+            return None
+        self.evaluator.biases_stepped(float(np.linalg.norm(off[:3])))
+        self._confirmed = False
+        return begun
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, frames: list[Stamped]) -> None:

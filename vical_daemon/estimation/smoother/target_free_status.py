@@ -144,6 +144,11 @@ class TargetFreeStatus(Evaluator):
         self._clock_changed_s.append(self.elapsed_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
+    def biases_stepped(self, gyro_rps: float) -> None:
+        """The biases of the imu stepped, the gyro's by so much, rad/s; all else is kept."""
+        self.announce(Event(EventKind.BIASES_STEPPED, value=gyro_rps))
+        self._quiet, self._against_since_s = (Cause.NONE, None), None
+
     @property
     def _clock_wanders(self) -> bool:
         """Whether the clocks changed twice, and may well change again: no time as long has passed since."""

@@ -102,6 +102,22 @@ def test_a_bump_too_small_for_two_seconds_is_found_all_the_same():
     assert record.snapshots[-1].status == "converged"
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_biases_that_step_are_no_bump(seed):
+    """No window fitted for 15 s; then `bumped` was announced, and all was estimated again."""
+    rng = np.random.default_rng([seed, 5])
+    rig = reference_rig(seed)
+    rig = replace(rig, gyro_bias=rig.gyro_bias.with_step(14.0, np.deg2rad(0.4) * rng.standard_normal(3)))
+    rig = replace(rig, accel_bias=rig.accel_bias.with_step(14.0, 0.05 * rng.standard_normal(3)))
+    run = simulate_tracks(seed, 24.0, rig=rig, landmarks_m=room_landmarks(seed, 200))
+    record = followed(run)
+    kinds = kinds_after(record, 0.0)
+    assert kinds.count(EventKind.BIASES_STEPPED) == 1 and not BUMPS & set(kinds)
+    last = record.snapshots[-1]
+    assert last.status == "converged"
+    assert (np.abs(last.error[:7]) < 4.0 * np.sqrt(np.diag(last.covariance)[:7])).all()
+
+
 def test_a_crowd_that_walks_past_is_no_bump():
     run = simulate_tracks(
         4, 24.0, rig=reference_rig(4, timeshift_cam_imu_s=0.01), landmarks_m=room_landmarks(4, 200)
