@@ -58,10 +58,7 @@ class Calibrator:
     """
 
     def __init__(
-        self,
-        options: CalibrationOptions,
-        cameras: dict[str, CameraPrior],
-        target_points_m: FloatArray | None,
+        self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray | None
     ) -> None:
         if target_points_m is None:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")

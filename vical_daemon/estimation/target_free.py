@@ -35,14 +35,7 @@ from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior,
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.smoother.waiting_tracks import (
-    SLACK_S,
-    STEP_S,
-    Ready,
-    Stamped,
-    cleaned,
-    ready,
-)
+from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.status.evaluator import PATIENCE_S
 

@@ -19,11 +19,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import (
-    ACCEL_BIAS_SIGMA_MPS2,
-    GYRO_BIAS_SIGMA_RPS,
-    WINDOW_START,
-)
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.temporal.rotation_curves import running_integral
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 

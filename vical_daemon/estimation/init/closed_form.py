@@ -30,12 +30,7 @@ from vical_daemon.estimation.init.spacing_ratio import spacing_ratio, stretched
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
-from vical_daemon.estimation.measurements import (
-    CalibrationOptions,
-    CameraPrior,
-    FloatArray,
-    Frames,
-)
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, Frames
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS

@@ -21,14 +21,7 @@ from vical_daemon.estimation.init.linear_start import LEAST_IMAGES, SPEED, Linea
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
-from vical_daemon.estimation.model.state import (
-    ATTITUDE,
-    POSITION,
-    VELOCITY,
-    CameraState,
-    MotionStart,
-    State,
-)
+from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, CameraState, MotionStart, State
 
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE_RAD = 0.03

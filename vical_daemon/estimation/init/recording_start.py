@@ -22,11 +22,7 @@ from vical_daemon.estimation.init.linear_start import (
 )
 from vical_daemon.estimation.init.motion_restart import MotionRestart, sigmas_of_motion
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
-from vical_daemon.estimation.model.priors import (
-    ACCEL_BIAS_SIGMA_MPS2,
-    GRAVITY_SIGMA_RAD,
-    GYRO_BIAS_SIGMA_RPS,
-)
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.model.state import BiasStart, MotionStart, State
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 

@@ -21,14 +21,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import CLOCK_CHANGES_HZ, OFF, SKEW_SIGMA, STEP_SIGMA_S
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.selection.clock_drift import stamps_variance
-from vical_daemon.estimation.smoother.marginal_prior import (
-    BIASES,
-    CORE,
-    SPEED,
-    TILT,
-    MarginalPrior,
-    root_of,
-)
+from vical_daemon.estimation.smoother.marginal_prior import BIASES, CORE, SPEED, TILT, MarginalPrior, root_of
 
 REMEMBERED = 8
 """Jumps that a carry holds: with ages that double, enough for ten minutes."""

@@ -7,12 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import (
-    CameraPrior,
-    FloatArray,
-    ImuNoise,
-    PointsFrame,
-)
+from vical_daemon.estimation.measurements import CameraPrior, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,

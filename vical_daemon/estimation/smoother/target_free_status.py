@@ -44,13 +44,7 @@ class TargetFreeStatus(Evaluator):
         rolling: The camera is configured with a rolling shutter, or its readout is asked for.
     """
 
-    def __init__(
-        self,
-        options: CalibrationOptions,
-        layout: Layout,
-        *,
-        rolling: bool = False,
-    ) -> None:
+    def __init__(self, options: CalibrationOptions, layout: Layout, *, rolling: bool = False) -> None:
         super().__init__(
             options, "no features have been followed yet: is the picture dark or blurred?", WINDOWS
         )

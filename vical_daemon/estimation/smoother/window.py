@@ -18,11 +18,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, ImuNoise
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
-from vical_daemon.estimation.model.inertial_links import (
-    RELINK_S,
-    PreintegratedLinks,
-    make_links,
-)
+from vical_daemon.estimation.model.inertial_links import RELINK_S, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 

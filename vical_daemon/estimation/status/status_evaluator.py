@@ -148,9 +148,7 @@ class StatusEvaluator(Evaluator):
 
     # ------------------------------------------------------------------ output
     def estimate(
-        self,
-        f: CalibrationFilter | None,
-        stale: CalibrationFilter | None = None,
+        self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
         """Put everything together; `stale`: what was known before a change, shown while restarting."""
         shares = None if f is None else model_selection.weights(f)

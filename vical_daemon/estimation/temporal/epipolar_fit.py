@@ -395,13 +395,7 @@ class _Fit:
         return out[1:], out[0][1], slope
 
     def _bent_by_noise(
-        self,
-        R: FloatArray,
-        shift: float,
-        bias: FloatArray,
-        weight: FloatArray,
-        slope: float,
-        error: float,
+        self, R: FloatArray, shift: float, bias: FloatArray, weight: FloatArray, slope: float, error: float
     ) -> FloatArray:
         """What the errors of the sightings do to mounting and delay on average, shape (4,).
 

@@ -19,11 +19,7 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftProblem, DriftSolution, solve
 from vical_daemon.estimation.temporal.drift_smoother import cost as drift_cost
-from vical_daemon.estimation.temporal.orientation_problem import (
-    Linear,
-    OrientationSensor,
-    linearise,
-)
+from vical_daemon.estimation.temporal.orientation_problem import Linear, OrientationSensor, linearise
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
@@ -193,11 +189,7 @@ def _stamp_rates(linear: Linear, S: int, scales: FloatArray) -> tuple[FloatArray
 
 
 def _update(
-    linear: Linear,
-    sensors: tuple[OrientationSensor, ...],
-    solution: DriftSolution,
-    *,
-    rescale: bool,
+    linear: Linear, sensors: tuple[OrientationSensor, ...], solution: DriftSolution, *, rescale: bool
 ) -> tuple[tuple[OrientationSensor, ...], float]:
     """Apply a step, and gate every orientation again by its residual over its noise."""
     noise = np.empty_like(solution.noise)

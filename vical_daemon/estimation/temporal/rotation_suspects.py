@@ -13,12 +13,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_reference import Reference
-from vical_daemon.estimation.temporal.rotation_start import (
-    Start,
-    agreement_scale,
-    coarse_start,
-    shift_costs,
-)
+from vical_daemon.estimation.temporal.rotation_start import Start, agreement_scale, coarse_start, shift_costs
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, camera_turns
 
 _CLEAR = 0.25  # misfit of turns over their size below which they fit

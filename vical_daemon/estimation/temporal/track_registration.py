@@ -30,11 +30,7 @@ _INLIERS = 0.5  # share of the feature pairs that must fit
 
 
 def track_registration(
-    t_imu_s: FloatArray,
-    gyro_rps: FloatArray,
-    frames: Frames,
-    lens: Lens,
-    options: TdIcpOptions | None = None,
+    t_imu_s: FloatArray, gyro_rps: FloatArray, frames: Frames, lens: Lens, options: TdIcpOptions | None = None
 ) -> TdIcpResult:
     """Find delay, mounting and gyro bias from a gyro and tracks.
 
