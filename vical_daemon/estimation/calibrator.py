@@ -19,8 +19,7 @@ from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
 from vical_daemon.estimation.init.late_camera import LateCameras
-from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is_lost
-from vical_daemon.estimation.init.recording_start import RecordingStart
+from vical_daemon.estimation.init.motion_restart import MotionRestart, RecordingStart, motion_is_lost
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.measurements import (
     LEAST_POINTS,

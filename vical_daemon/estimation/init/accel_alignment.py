@@ -26,8 +26,16 @@ from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
 _STEP_S = 0.01  # between windows, a fortieth of their length
 PRIORS = 9
-"""Rows for these three vectors."""
+"""Rows of what is known before: lever arm, accelerometer bias and gyro bias."""
 _MIN_WINDOWS = 12  # 36 equations for a rotation and three vectors
+_COARSE_S, _FINE_S = 0.02, 0.004  # grids of time shifts; a hand's acceleration changes over 0.1 s
+_APART_S = 0.25  # another delay this far away must fit worse by the contrast
+_MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
+ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
+"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
+_DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
+_ALIGNED = so3.signed_permutations()
+_STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]
 
 
 @dataclass(frozen=True)
@@ -149,14 +157,6 @@ def _other_unknowns(
     sigmas = np.repeat([WINDOW_START.lever_arm_m, ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS], 3)
     out[-PRIORS:, 3:] = np.diag(1.0 / sigmas)
     return out
-
-
-_COARSE_S, _FINE_S = 0.02, 0.004  # grids of time shifts; a hand's acceleration changes over 0.1 s
-_APART_S = 0.25  # another delay this far away must fit worse by the contrast
-_MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
-ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
-"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
-_DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
 
 
 @dataclass(frozen=True)
@@ -342,7 +342,3 @@ def _tangent(R: FloatArray) -> FloatArray:
     """Derivative of vec(exp(w) R) by w at 0, shape (..., 9, 3)."""
     generators = so3.hat(np.eye(3))
     return np.stack([(generators[m] @ R).reshape(*R.shape[:-2], 9) for m in range(3)], axis=-1)
-
-
-_ALIGNED = so3.signed_permutations()
-_STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]

@@ -24,8 +24,13 @@ from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.numbering import numbered_differently
-from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
-from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
+from vical_daemon.estimation.init.readout_start import (
+    at_middle_row,
+    lens_fit,
+    likely_axis,
+    looks_rolling,
+    readout,
+)
 from vical_daemon.estimation.init.spacing_ratio import spacing_ratio, stretched
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start

@@ -22,8 +22,13 @@ from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
-from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.status.evaluator import (
+    Evaluator,
+    Verdict,
+    lacking_verdict,
+    lens_known,
+    lens_verdict,
+)
 from vical_daemon.estimation.wording import cause_text
 
 _ENOUGH_WINDOWS = 2  # the first one shows only what it was fitted to

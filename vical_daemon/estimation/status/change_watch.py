@@ -26,6 +26,11 @@ from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_S
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 
 _SPAN = 20  # estimates that are compared, one a second
+IMAGES = 10
+"""Images refused in a row after which the pose is found again, and images after an alarm that show what has
+changed."""
+_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
+_DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 
 @dataclass(slots=True)
@@ -71,13 +76,6 @@ class DriftWatch:
         self._past.append((t_s, value, variance))
         self.doubtful = bool(far > PERHAPS_SIGMAS)
         return bool(far > SURE_SIGMAS)
-
-
-IMAGES = 10
-"""Images refused in a row after which the pose is found again, and images after an alarm that show what has
-changed."""
-_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
-_DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 
 class Action(Enum):

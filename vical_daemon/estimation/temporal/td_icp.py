@@ -20,9 +20,8 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve
-from vical_daemon.estimation.temporal.rotation_reference import GyroReference, Reference, StreamReference
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
-from vical_daemon.estimation.temporal.rotation_suspects import explain
+from vical_daemon.estimation.temporal.rotation_start import GyroReference, Reference, StreamReference
 from vical_daemon.estimation.temporal.td_icp_input import (
     USUAL_RAD,
     CleanStream,
@@ -31,7 +30,7 @@ from vical_daemon.estimation.temporal.td_icp_input import (
     clean_gyro,
     clean_stream,
 )
-from vical_daemon.estimation.temporal.td_icp_refusals import judge, refuse_motion, refuse_start
+from vical_daemon.estimation.temporal.td_icp_refusals import explain, judge, refuse_motion, refuse_start
 from vical_daemon.estimation.temporal.td_icp_result import (
     DEGENERATE,
     OK,
