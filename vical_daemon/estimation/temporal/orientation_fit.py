@@ -24,8 +24,6 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
-__all__ = ["Fit", "OrientationSensor", "polish"]
-
 _GATE = chi_square_limit(3, PERHAPS_SIGMAS)  # of an orientation
 _ROUNDS = 12  # Gauss-Newton steps, at most; each finds again which orientations count
 _SHIFT_DONE_S = 2e-8  # a change of the shift below this ends it: a hundredth of the best sigmas
@@ -171,7 +169,8 @@ def polish(
     S, scales = len(sensors), scales_of(sensors, log_gyro)
     widened = widening(scaled(linear, scales), linear.used, S)
     factor = np.concatenate([np.repeat(widened, (3, 1), axis=1).ravel(), np.ones(3)])
-    covariance = _wanted(solution.covariance, S) * np.outer(factor, factor)
+    wanted = [*range(4 * S), -3, -2, -1]  # without the gyro's matrix: mountings and shifts, then the bias
+    covariance = solution.covariance[np.ix_(wanted, wanted)] * np.outer(factor, factor)
     return Fit(sensors, covariance, bias, rounds, *_stamp_rates(linear, S, scales), widened)
 
 
@@ -221,10 +220,3 @@ def _update(
             )
         )
     return tuple(updated), largest
-
-
-def _wanted(covariance: FloatArray, S: int) -> FloatArray:
-    """Leave out the gyro's matrix: mountings and shifts, then the bias."""
-    p = len(covariance) - 3
-    keep = [*range(4 * S), *range(p, p + 3)]
-    return covariance[np.ix_(keep, keep)]

@@ -58,16 +58,13 @@ class Start:
 
 def angles_between(qa: FloatArray, qb: FloatArray) -> FloatArray:
     """Angles between orientations given as quaternions (..., 4), rad, shape (...,)."""
-    dot = np.abs(np.vecdot(qa, qb))
-    out: FloatArray = 2.0 * np.arccos(np.minimum(dot, 1.0))
-    return out
+    return np.asarray(2.0 * np.arccos(np.minimum(np.abs(np.vecdot(qa, qb)), 1.0)))
 
 
 def robust_cost(difference: FloatArray, scale: float) -> FloatArray:
     """Geman-McClure: 0 for agreement, towards 1 for gross disagreement."""
     d2 = (difference / scale) ** 2
-    out: FloatArray = d2 / (1.0 + d2)
-    return out
+    return np.asarray(d2 / (1.0 + d2))
 
 
 def shift_costs(
@@ -86,9 +83,7 @@ def shift_costs(
     ia, ib = a + offsets[:, None], b + offsets[:, None]
     inside = (ia >= 0) & (ib < len(grid))
     angle = angles_between(grid[np.where(inside, ia, 0)], grid[np.where(inside, ib, 0)])
-    cost = np.where(inside, robust_cost(angle - turns.angle, scale), 0.6)
-    out: FloatArray = cost.mean(axis=1)
-    return out
+    return np.asarray(np.where(inside, robust_cost(angle - turns.angle, scale), 0.6).mean(axis=1))
 
 
 def agreement_scale(turns: Turns) -> float:
@@ -158,40 +153,30 @@ def _start_at(
     if np.count_nonzero(use) < 6:
         return None
     qa, qb = curve.quaternion(ta[best][use]), curve.quaternion(tb[best][use])
-    turn_imu = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(qa), qb))
+    turn_imu = so3.turn_between(qa, qb)
     dt = tb[best][use] - ta[best][use]
-    fit = _mounting(turn_imu, turns.rotvec_cam[use], dt)
+    R, bias, misfit, mirrored = _mounting(turn_imu, turns.rotvec_cam[use], dt)
     agreement = float(np.mean(np.abs(difference[best][inside[best]]) < scale))
     # turns whose size does not agree count as badly as a whole turn misplaced
     share = np.count_nonzero(use) / len(turns.first)
     return Start(
         shift,
-        fit.R,
-        fit.bias,
+        R,
+        bias,
         agreement,
-        fit.misfit / share**2,
-        fit.mirrored,
+        misfit / share**2,
+        mirrored,
         float(np.median(turns.angle)),
         turns.baseline_s,
         scale,
     )
 
 
-@dataclass(frozen=True)
-class _Mounting:
-    R: FloatArray
-    bias: FloatArray
-    misfit: float
-    mirrored: bool
-
-
-def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mounting:
-    """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; watches for mirrored axes."""
-    weight = np.ones(len(dt))
-    bias = np.zeros(3)
-    R = np.eye(3)
-    residual = turn_imu
-    mirrored = False
+def _mounting(
+    turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray
+) -> tuple[FloatArray, FloatArray, float, bool]:
+    """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; the misfit; mirrored axes?"""
+    weight, bias = np.ones(len(dt)), np.zeros(3)
     for i in range(8):
         target = turn_imu - bias * dt[:, None]
         U, s, Vt = np.linalg.svd((target * weight[:, None]).T @ turn_cam)
@@ -206,8 +191,7 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
         residual = residual - bias * dt[:, None]
         length2 = np.vecdot(residual, residual)
         weight = geman_mcclure_weight(length2 / max(2.0 * float(np.median(length2)), 1e-12))
-    misfit = float(np.sqrt(np.median(np.vecdot(residual, residual))))
-    return _Mounting(R, bias, misfit, mirrored)
+    return R, bias, float(np.sqrt(np.median(length2))), mirrored
 
 
 @dataclass(frozen=True)

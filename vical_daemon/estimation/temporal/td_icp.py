@@ -18,7 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
+from vical_daemon.estimation.temporal.orientation_fit import Fit, polish
+from vical_daemon.estimation.temporal.orientation_problem import OrientationSensor
 from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import GyroReference, Reference, StreamReference
