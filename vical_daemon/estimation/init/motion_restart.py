@@ -104,11 +104,11 @@ class MotionRestart:
             state: With the calibration as it is known.
             buffer: Inertial readings.
         """
+        t_s = t_cam_s + _camera(state, frame).timeshift_s
         if self.frames:
             before_s = self.frames[-1][0] + _camera(state, self.frames[-1][1]).timeshift_s
-        t_s = t_cam_s + _camera(state, frame).timeshift_s
-        if self.frames and (t_s < before_s or buffer.gap_within(before_s, t_s)):
-            self.frames, self._seen = [], []
+            if t_s < before_s or buffer.gap_within(before_s, t_s):
+                self.frames, self._seen = [], []
         if t_s < buffer.oldest_s or buffer.gap_within(t_s, t_s):
             return
         seen = pose_of(frame, t_cam_s, _camera(state, frame), self._target)
@@ -185,12 +185,18 @@ class MotionRestart:
 
 def _turned(t_s: float, R: FloatArray, f: CalibrationFilter, buffer: ImuBuffer) -> FloatArray | None:
     """How the attitude `R` by an image at `t_s` differs from that by the imu since the motion was lost."""
+    there = ahead(f, buffer, t_s)
+    return None if there is None else np.asarray(R @ there.state.R_world_imu.T)
+
+
+def ahead(f: CalibrationFilter, buffer: ImuBuffer, t_s: float) -> CalibrationFilter | None:
+    """A copy of a filter at a later instant, s, by the readings alone; None where these do not reach."""
     segment = buffer.segment(f.state.t_s, t_s)
     if segment is None:
         return None
-    ahead = f.copy()
-    ahead.predict(segment)
-    return np.asarray(R @ ahead.state.R_world_imu.T)
+    out = f.copy()
+    out.predict(segment)
+    return out
 
 
 def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> FloatArray:
@@ -236,14 +242,12 @@ def motion_is_lost(
         return True
     if t_s < f.state.t_s + IMAGE_GAP_S:
         return False
-    segment = buffer.segment(f.state.t_s, t_s)
-    if segment is None:
+    there = ahead(f, buffer, t_s)
+    if there is None:
         return False
-    ahead = f.copy()
-    ahead.predict(segment)
-    sigmas = ahead.sigmas()
+    sigmas = there.sigmas()
     turn, away = float(sigmas[ATTITUDE].max()), float(sigmas[POSITION].max())
-    if _near(turn, away, _distance_m(ahead.state.p_world_imu)):
+    if _near(turn, away, _distance_m(there.state.p_world_imu)):
         return False
     seen = pose_of(frame, t_cam_s, camera, target)
     if seen is None:

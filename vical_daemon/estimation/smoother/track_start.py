@@ -107,10 +107,9 @@ class TrackStart:
         self.camera, self._gravity_mps2 = camera, gravity_mps2
         self._R = products(links.dR[None])[0]
         self._motion = LinearMotion.along(self._R, links.dt, links.dR, links.dv, links.dp)
-        none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         zero = np.zeros((len(frames), 3))
         window = Window(
-            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, none
+            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, Landmarks.none()
         )
         window.bias[:, :3], window.imu = imu[:3], imu[6:]
         window.fit_knots()
@@ -122,7 +121,7 @@ class TrackStart:
                 " more texture or slower motion is needed"
             )
         self._rays, self._ok = rays_of(self._seen.uv, camera)
-        window.landmarks = none
+        window.landmarks = Landmarks.none()
         self._window = window
 
     def misfit(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> float:

@@ -70,6 +70,11 @@ class Landmarks:
     bearing: FloatArray
     inverse: FloatArray
 
+    @classmethod
+    def none(cls) -> Landmarks:
+        """No points."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
 
 @dataclass(slots=True)
 class Window:
