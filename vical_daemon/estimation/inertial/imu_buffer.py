@@ -178,29 +178,8 @@ class ImuBuffer:
 
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
         """Return the readings between two instants with interpolated ends; None where not covered."""
-        rows = self.rows
-        if not len(rows) or from_s < rows[0, 0] or to_s > rows[-1, 0] or to_s < from_s:
-            return None
-        t = rows[:, 0]
-        low = int(t.searchsorted(from_s, side="right"))
-        high = int(t.searchsorted(to_s, side="left"))
-        first, last = max(low - 1, 0), min(max(high, 1), len(rows) - 1)
-        if last == first:
-            only = np.repeat(rows[first][None], 2, axis=0)
-            return ImuSegment(np.array([from_s, to_s]), only[:, 1:4], only[:, 4:], 0.0)
-        inside = rows[first : last + 1]
-        slope = _slopes(rows[max(first - 2, 0) : last + 3], first - max(first - 2, 0), len(inside))
-        ends = np.array([from_s, to_s])
-        k = np.array([0, len(inside) - 2])
-        value, change = _hermite(inside, slope, ends, k)
-        middle = slice(low - first, high - first)
-        cut = np.concatenate([value[:1], inside[middle, 1:], value[1:]])
-        rise = np.concatenate([change[:1], slope[middle], change[1:]])
-        times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
-        gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
-        at = np.arange(low - 1, high + 1) - first
-        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, ends, np.array([0, len(times)]))
-        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], sigma)
+        found = self.intervals(np.array([from_s, to_s]))
+        return None if found is None else found[0]
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -221,14 +200,15 @@ class ImuBuffer:
         first = min(max(int(after[0]) - 1, 0), len(rows) - 2)
         last = max(int(before[-1]), first + 1)
         slope = _slopes(rows[max(first - 2, 0) : last + 3], first - max(first - 2, 0), last + 1 - first)
-        k = np.clip(after - 1 - first, 0, last - first - 1)
+        k = np.minimum(np.maximum(after - 1 - first, 0), last - first - 1)
         value, change = _hermite(rows[first : last + 1], slope, t_s, k)
-        begin = np.concatenate([[0], np.cumsum(inside + 2)])
-        at = np.arange(begin[-1]) + np.repeat(after[:-1] - begin[:-1] - 1, inside + 2)
-        nodes, rise = np.take(rows, at, axis=0, mode="clip"), np.take(slope, at - first, axis=0, mode="clip")
+        begin = np.zeros(len(t_s), np.intp)
+        (inside + 2).cumsum(out=begin[1:])
+        at = np.arange(begin[-1]) + (after[:-1] - begin[:-1] - 1).repeat(inside + 2)
+        nodes, rise = rows.take(at, axis=0, mode="clip"), slope.take(at - first, axis=0, mode="clip")
         for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
             nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
-        gap = float(np.diff(t[first : last + 1]).max())
+        gap = float((t[first + 1 : last + 1] - t[first:last]).max())
         sigma = self._clipping_sigma_at(slice(first, last + 1), at - first, k, t_s, begin)
         segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], sigma)
         return segment, begin[:-1]
