@@ -283,10 +283,8 @@ class _Turns:
         h = (self._t[k + 1] - self._t[k])[:, None]
         u = (t_s - self._t[k])[:, None] / h
         A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._rate[k + 1] - self._rate[k]
-        mean = self._rate[k] + u * (
-            0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
-        )
-        return np.asarray(self._sum[k] + u * h * mean)
+        bent = 0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
+        return np.asarray(self._sum[k] + u * h * (self._rate[k] + u * bent))
 
 
 def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:

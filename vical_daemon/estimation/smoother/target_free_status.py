@@ -82,7 +82,7 @@ class TargetFreeStatus(Evaluator):
         self._after_change(self.camera)
         if self._quiet[0]:
             cause, value = self._quiet
-            self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
+            self.announce(Event(EventKind.WENT_ON, self.camera, cause=cause, cause_value=value))
             self._quiet = Cause.NONE, None
 
     def lost(
@@ -139,7 +139,7 @@ class TargetFreeStatus(Evaluator):
 
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; all else is kept."""
-        self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
+        self.announce(Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s))
         self._clock_changed_s.append(self.elapsed_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
@@ -150,16 +150,6 @@ class TargetFreeStatus(Evaluator):
             return False
         before_s, last_s = self._clock_changed_s
         return self.elapsed_s - last_s < last_s - before_s
-
-    def _announce(
-        self,
-        kind: EventKind,
-        value: float | None = None,
-        *,
-        cause: Cause = Cause.NONE,
-        cause_value: float | None = None,
-    ) -> None:
-        self.announce(Event(kind, self.camera, value, cause=cause, cause_value=cause_value))
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:

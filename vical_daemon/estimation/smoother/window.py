@@ -311,9 +311,8 @@ def place(
     anchor = c[first]
     P = (np.eye(3) - d[:, :, None] * d[:, None, :]) * ok[:, None, None]
     N = np.add.reduceat(P, first) + 1e-6 * np.eye(3)
-    X = np.linalg.solve(N, np.add.reduceat(np.matmul(P, (c - anchor[seen.landmark])[..., None]), first))[
-        ..., 0
-    ]
+    away = np.add.reduceat(np.matmul(P, (c - anchor[seen.landmark])[..., None]), first)
+    X = np.linalg.solve(N, away)[..., 0]
     # the middle observation gives the bearing of those whose rays hardly cross
     distance = np.linalg.norm(X, axis=1)
     along = (X * d[first]).sum(axis=1) / np.maximum(distance, 1e-9)

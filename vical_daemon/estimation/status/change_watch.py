@@ -65,14 +65,10 @@ class DriftWatch:
         """
         if not self.due(t_s):
             return False
-        far = max(
-            (
-                abs(value - old)
-                / np.sqrt(factor * max(old_variance + walk * (t_s - at_s) - variance, 0.0) + self.floor**2)
-                for at_s, old, old_variance in self._past
-            ),
-            default=0.0,
-        )
+        far = 0.0
+        for at_s, old, old_variance in self._past:
+            gained = factor * max(old_variance + walk * (t_s - at_s) - variance, 0.0)
+            far = max(far, abs(value - old) / np.sqrt(gained + self.floor**2))
         self._past.append((t_s, value, variance))
         self.doubtful = bool(far > PERHAPS_SIGMAS)
         return bool(far > SURE_SIGMAS)
@@ -207,9 +203,8 @@ class ChangeWatch:
         if index is None:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR))
-        watch.floor = float(
-            np.hypot(_DRIFT_FLOOR, np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s)))
-        )
+        by_stamps = np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s))
+        watch.floor = float(np.hypot(_DRIFT_FLOOR, by_stamps))
         if not watch.due(t_s):
             return Action.NONE
         variance, walk = float(f.S[index] @ f.S[index]), float(f.walk[index])

@@ -70,10 +70,6 @@ class ImageCoverage:
         if self._least >= _PARTLY * self._most:
             return ()
         seen = self._counts >= _LEAST
-        edges: dict[Edge, BoolArray] = {
-            "left": seen[:, 0],
-            "right": seen[:, -1],
-            "top": seen[0],
-            "bottom": seen[-1],
-        }
+        edges: dict[Edge, BoolArray]
+        edges = {"left": seen[:, 0], "right": seen[:, -1], "top": seen[0], "bottom": seen[-1]}
         return tuple(name for name, parts in edges.items() if parts.mean() < _SHARE)
