@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from vical_daemon.estimation.init.accelerometer_check import explain_accelerometer
-from vical_daemon.estimation.temporal.td_icp import REFUSED, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_result import REFUSED
 from vical_daemon.offline.calibration_job import Job
 from vical_daemon.offline.errors import InputError
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds

@@ -37,9 +37,10 @@ from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, S
 from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, Frames
 from vical_daemon.estimation.model.state import CameraState, Layout
-from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
+from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about

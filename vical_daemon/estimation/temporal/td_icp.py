@@ -41,19 +41,6 @@ from vical_daemon.estimation.temporal.td_icp_result import (
     pair_delays,
 )
 
-__all__ = [
-    "DEGENERATE",
-    "OK",
-    "REFUSED",
-    "JointResult",
-    "OrientationStream",
-    "TdIcpOptions",
-    "TdIcpResult",
-    "joint_of_orientations",
-    "joint_with_gyro",
-    "td_icp",
-]
-
 ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
 _DOUBTFUL_RAD = float(np.deg2rad(0.5))
 """Noise of one orientation above which the usual mistakes are tried out."""
