@@ -42,9 +42,9 @@ from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
 _KEEP_S = 5.0  # of readings before the oldest image that may still be used
-_SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 
 
 class Calibrator:
@@ -268,7 +268,7 @@ class Calibrator:
         assert f is not None
         lost.take(frame, t_cam_s, f.state, self._buffer)
         if frame.camera in self._seek_shift:
-            if len(lost.frames) < _SEEK_IMAGES:
+            if len(lost.frames) < MIN_ORIENTATIONS:
                 return []
             lost = self._seek(f, lost, frame.camera)
         self._trim(lost.frames[0][0] if lost.frames else t_cam_s)

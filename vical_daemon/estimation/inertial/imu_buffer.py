@@ -21,7 +21,8 @@ GAP_S = 0.05
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
-_HALF_BLOCK_S = 2.5e-3  # of `BlockMeans`
+BLOCK_S = 5.005e-3
+"""A block of `BlockMeans` may be so long: readings of up to 333 Hz stay as they are; stamps have jitter."""
 _ROOM = 4096  # readings for which there is room at first
 _USUAL = 201  # samples whose median interval is the usual one
 
@@ -138,7 +139,7 @@ class ImuBuffer:
         if not len(self):
             return
         row = self._start + int(np.argmin(np.abs(self.rows[:, 0] - t_s)))
-        if abs(self._rows[row, 0] - t_s) < _HALF_BLOCK_S:
+        if abs(self._rows[row, 0] - t_s) < 0.5 * BLOCK_S:
             for column in (self._rows, self._clipping_sigma):
                 if column is not None:
                     column[row : self._stop - 1] = column[row + 1 : self._stop]

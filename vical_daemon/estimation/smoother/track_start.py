@@ -37,7 +37,6 @@ ROUNDS = 8  # of reweighting by the depths found and by outliers
 _RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
 _STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
 _FINE_RAD = float(np.deg2rad(4.0))  # likewise about the best: the window converges from there
-_ROUGH_ROUNDS = 4  # of reweighting at each angle tried first
 _APART_RAD = float(np.deg2rad(45.0))  # from here on it is another mounting
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
@@ -256,7 +255,7 @@ def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, a
     def misfit(angle: float, rounds: int = ROUNDS) -> float:
         return start.misfit(so3.exp(angle * axis) @ R_imu_cam, arm, rounds)
 
-    found = np.array([misfit(a, _ROUGH_ROUNDS) for a in angles])
+    found = np.array([misfit(a, ROUNDS // 2) for a in angles])
     best = float(angles[np.argmin(found)])
     away = np.abs((angles - best + np.pi) % (2.0 * np.pi) - np.pi) > _APART_RAD
     if not found.min() * _CONTRAST < found[away].min():

@@ -19,8 +19,7 @@ from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
-_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s
-_FINE_S = 0.0025  # likewise about the best ones
+_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s; a quarter of it about the best ones
 _CANDIDATES = 4  # shifts whose directions are compared too: periodic motion agrees in size at several
 
 
@@ -139,7 +138,7 @@ def _start_at(
     curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float
 ) -> Start | None:
     """Refine the shift around a grid point and solve for the mounting there."""
-    fine = shift_s + np.arange(-6, 7) * _FINE_S
+    fine = shift_s + np.arange(-6, 7) * (_GRID_S / 4.0)
     low, high = curve.span_s
     ta, tb = t_cam_s[turns.first] + fine[:, None], t_cam_s[turns.second] + fine[:, None]
     inside = (ta >= low) & (tb <= high)

@@ -20,7 +20,7 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 IntArray = npt.NDArray[np.intp]
 
 MIN_RATE_RPS = np.deg2rad(3.0)  # slower than this is "not moving"
-MIN_PAIRS = 8  # 24 equations for mounting, bias and delay
+MIN_PAIRS = 8  # 24 equations for mounting, bias and delay; as many orientations for a world and a delay
 # Turns are taken over the shortest of these times over which they are distinct, s: a short one is little
 # touched by outliers, by the gyro's bias and by holes; each doubling doubles the turn over the same noise.
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)

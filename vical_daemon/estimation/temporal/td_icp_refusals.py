@@ -32,7 +32,7 @@ _CLEAR = 0.25  # misfit of turns over their size below which they fit
 _AGREE = 0.6  # share of the turns that agree in size where stamps are no longer stretched
 BETTER = 0.6  # misfit over that of the data as they are
 _MOST = 0.22  # by which stamps may be stretched: 30 images a second counted as 25 are 0.2
-_STEP, _FINE = 0.02, 0.0025  # between the factors tried; likewise about the best
+_STEP = 0.02  # between the factors tried; a quarter of it about the best
 _GRID_S = 0.02  # of the shifts tried with each factor
 _LONGEST_S = 12.0  # of the data looked at: with more, the factors would have to be closer
 _TURNS = 80  # enough to tell factors apart
@@ -133,7 +133,7 @@ def estimate_clock_rate(
 
     coarse = 1.0 + np.arange(-_MOST, _MOST + 0.5 * _STEP, _STEP)
     best = float(coarse[np.argmin([cost(f) for f in coarse])])
-    fine = best + np.arange(-3, 4) * _FINE * 2.0
+    fine = best + np.arange(-3, 4) * (_STEP / 4.0)
     best = float(fine[np.argmin([cost(f) for f in fine])])
     if abs(best - 1.0) < 0.01:
         return None
