@@ -37,6 +37,7 @@ _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predict
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
 """What a step changes of a window."""
+_MEMORY = 25  # images over which an error of the pixels may last
 LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
 
 
@@ -377,7 +378,7 @@ def correlation(e: FloatArray, seen: Seen) -> float:
     e = e * huber_weight(np.sqrt((e**2).sum(axis=1, keepdims=True)), HUBER)
     variance = float((e**2).mean())
     total = 1.0
-    for k in range(1, len(e)):
+    for k in range(1, min(_MEMORY, len(e))):
         same = (seen.landmark[k:] == seen.landmark[:-k]) & (seen.frame[k:] - seen.frame[:-k] == k)
         count = int(same.sum())
         if count < 50:
