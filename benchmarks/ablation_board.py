@@ -46,9 +46,9 @@ from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status import change_watch
 from vical_daemon.estimation.status.change_watch import ChangeWatch, DriftWatch
+from vical_daemon.estimation.status.evaluator import SteadyStatus
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
-from vical_daemon.estimation.status.steady_status import SteadyStatus
 
 
 def _no_state(block: str) -> Callable[[], list[tuple[Any, ...]]]:

@@ -16,13 +16,9 @@ from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
-from vical_daemon.estimation.temporal.td_icp import (
-    OrientationStream,
-    TdIcpOptions,
-    TdIcpResult,
-    joint_with_gyro,
-    td_icp,
-)
+from vical_daemon.estimation.temporal.td_icp import joint_with_gyro, td_icp
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream, TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 FloatArray = npt.NDArray[np.float64]
 _LENS_VIEWS = 60

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from vical_mocks.rotations import exp_so3, log_so3
 from vical_mocks.trajectory import Trajectory, hand_motion
 
-from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
 FloatArray = npt.NDArray[np.float64]
 

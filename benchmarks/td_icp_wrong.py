@@ -10,7 +10,8 @@ from vical_mocks.rotations import exp_so3
 from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
-from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
 FloatArray = npt.NDArray[np.float64]
 

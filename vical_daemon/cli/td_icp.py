@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 def _single(args: argparse.Namespace, request: TdIcpRequest) -> int:
     """One imu and one camera."""
     from vical_daemon.cli.td_icp_report import print_single, report_json
-    from vical_daemon.estimation.temporal.td_icp import REFUSED
+    from vical_daemon.estimation.temporal.td_icp_result import REFUSED
     from vical_daemon.offline.td_icp.single import register_camera
 
     found = register_camera(request, args.watch)
@@ -92,7 +92,7 @@ def _single(args: argparse.Namespace, request: TdIcpRequest) -> int:
 def _joint(args: argparse.Namespace, request: TdIcpRequest, names: list[str]) -> int:
     """Any number of sensors."""
     from vical_daemon.cli.td_icp_report import print_joint
-    from vical_daemon.estimation.temporal.td_icp import REFUSED
+    from vical_daemon.estimation.temporal.td_icp_result import REFUSED
     from vical_daemon.offline.td_icp.sensors import register_sensors
 
     result, lenses = register_sensors(request, names)
@@ -105,7 +105,7 @@ def _joint(args: argparse.Namespace, request: TdIcpRequest, names: list[str]) ->
 
 
 def _end(status: str, what: str, reason: str) -> int:
-    from vical_daemon.estimation.temporal.td_icp import REFUSED
+    from vical_daemon.estimation.temporal.td_icp_result import REFUSED
 
     if status == REFUSED:
         raise CliError(f"no {what} found: {reason}")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.temporal.delay_windows import DelayReport
-    from vical_daemon.estimation.temporal.td_icp import JointResult, TdIcpResult
+    from vical_daemon.estimation.temporal.td_icp_result import JointResult, TdIcpResult
     from vical_daemon.offline.td_icp.sources import LensUsed
 
 

@@ -19,8 +19,7 @@ from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
 from vical_daemon.estimation.init.late_camera import LateCameras
-from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is_lost
-from vical_daemon.estimation.init.recording_start import RecordingStart
+from vical_daemon.estimation.init.motion_restart import MotionRestart, RecordingStart, motion_is_lost
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.measurements import (
     LEAST_POINTS,
@@ -43,9 +42,9 @@ from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
 _KEEP_S = 5.0  # of readings before the oldest image that may still be used
-_SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 
 
 class Calibrator:
@@ -58,10 +57,7 @@ class Calibrator:
     """
 
     def __init__(
-        self,
-        options: CalibrationOptions,
-        cameras: dict[str, CameraPrior],
-        target_points_m: FloatArray | None,
+        self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray | None
     ) -> None:
         if target_points_m is None:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")
@@ -101,7 +97,9 @@ class Calibrator:
         self.evaluator.announce_all(self._intake.imu_news())
 
     @property
-    def _buffer(self) -> ImuBuffer | None:
+    def _buffer(self) -> ImuBuffer:
+        """Readings, once there are any."""
+        assert self._intake.buffer is not None
         return self._intake.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
@@ -122,8 +120,12 @@ class Calibrator:
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
-        if self._pace.takes(frame.camera, t_cam_s, self.evaluator.motion.rate_change_rps2, self._buffer):
-            self._pending.push(t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer))
+        if self._pace.takes(
+            frame.camera, t_cam_s, self.evaluator.motion.rate_change_rps2, self._intake.buffer
+        ):
+            self._pending.push(
+                t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._intake.buffer)
+            )
 
     def _clock_was_set(self, camera: str) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
@@ -150,7 +152,7 @@ class Calibrator:
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
         """Do what can be done with what has arrived."""
-        if self._buffer is None:
+        if self._intake.buffer is None:
             return []
         if self.filter is None or self.filter.unobservable is not None:
             self._maybe_start()
@@ -159,7 +161,7 @@ class Calibrator:
 
     def finish(self) -> list[FrameReport]:
         """End of the data: a last attempt to start, and all frames that inertial data cover."""
-        if self._buffer is None:
+        if self._intake.buffer is None:
             return []
         if self.filter is None:
             self._maybe_start(at_end=True)
@@ -169,7 +171,6 @@ class Calibrator:
 
     def _maybe_start(self, *, at_end: bool = False) -> None:
         """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
-        assert self._buffer is not None
         if self.filter is None:
             self._initializer.take(self._pending.take_all())
             self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
@@ -190,7 +191,7 @@ class Calibrator:
     def _maybe_join(self, *, at_end: bool = False) -> None:
         """Let a camera that sees the target for the first time join the others."""
         f = self.filter
-        found = None if f is None or self._buffer is None else self._late.attempt(self._buffer, at_end=at_end)
+        found = None if f is None else self._late.attempt(self._buffer, at_end=at_end)
         if found is None:
             return
         if found.rolling is not None:  # one more unknown: everything anew
@@ -221,7 +222,6 @@ class Calibrator:
 
     def _take_start(self, f: LinearisedFilter, frames: Frames) -> Frames:
         """Take the images of a start; return those that readings do not cover yet."""
-        assert self._buffer is not None
         for k, (t_cam_s, frame) in enumerate(frames):
             if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.settled_s:
                 return frames[k:]
@@ -239,7 +239,7 @@ class Calibrator:
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
         reports, self._reports = self._reports, []
-        while self.filter is not None and self._buffer is not None:
+        while self.filter is not None:
             shifts = {name: c.timeshift_s for name, c in self.filter.state.cameras.items()}
             covered_s = self._buffer.newest_s if flush else self._buffer.settled_s
             item = self._pending.pop(shifts, covered_s, flush=flush)
@@ -266,10 +266,9 @@ class Calibrator:
         """Take the motion anew as soon as images show it, and follow those it was taken from."""
         f = self.filter
         assert f is not None
-        assert self._buffer is not None
         lost.take(frame, t_cam_s, f.state, self._buffer)
         if frame.camera in self._seek_shift:
-            if len(lost.frames) < _SEEK_IMAGES:
+            if len(lost.frames) < MIN_ORIENTATIONS:
                 return []
             lost = self._seek(f, lost, frame.camera)
         self._trim(lost.frames[0][0] if lost.frames else t_cam_s)
@@ -285,12 +284,10 @@ class Calibrator:
 
     def _trim(self, needed_s: float) -> None:
         """Forget readings that nothing will ask for: not those from `needed_s` on."""
-        assert self._buffer is not None
         self._buffer.trim(min(needed_s, self._initializer.oldest_s, self._late.oldest_s) - _KEEP_S)
 
     def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
         """Propagate a filter to one image and correct it; None where inertial data are missing."""
-        assert self._buffer is not None
         t_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
         if t_s < f.state.t_s - LATE_S:
             return None
@@ -309,7 +306,6 @@ class Calibrator:
         f = self.filter
         if f is None:  # an image before this one ended it
             return []
-        assert self._buffer is not None
         report = self._step(f, frame, t_cam_s)
         if report is None:
             self._intake.images_ignored += 1
@@ -362,7 +358,6 @@ class Calibrator:
 
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
         """See whether images no longer fit because something jumped; go on with all of that unknown."""
-        assert self._buffer is not None
         if f.unobservable is not None:
             return False
         before, fit = self._past.filter(f), None  # images since have moved the present one
@@ -423,7 +418,6 @@ class Calibrator:
 
     def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
         """After the clock of a camera was set: find its time shift from the images collected."""
-        assert self._buffer is not None
         self._seek_shift.discard(camera)
         if isinstance(lost, RecordingStart):  # the gyro's bias is that of another recording
             f.state.gyro_bias = lost.gyro_bias(f.state, self._buffer)

@@ -41,14 +41,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.smoother.waiting_tracks import (
-    SLACK_S,
-    STEP_S,
-    Ready,
-    Stamped,
-    cleaned,
-    ready,
-)
+from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.status.evaluator import PATIENCE_S
 
@@ -129,7 +122,9 @@ class TargetFreeCalibrator:
         return self._first.initializer
 
     @property
-    def _buffer(self) -> ImuBuffer | None:
+    def _buffer(self) -> ImuBuffer:
+        """Readings, once there are any."""
+        assert self._intake.buffer is not None
         return self._intake.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
@@ -184,7 +179,7 @@ class TargetFreeCalibrator:
         return self._work(flush=True)
 
     def _work(self, *, flush: bool) -> list[FrameReport]:
-        if self._buffer is None:
+        if self._intake.buffer is None:
             return []
         while True:
             if self.window is None:
@@ -205,7 +200,6 @@ class TargetFreeCalibrator:
 
     def _ready(self, window: Window) -> Ready:
         """Images that inertial data cover, at most a step's worth, up to the first gap."""
-        assert self._buffer is not None
         end_s = self._buffer.settled_s - window.shift_s - _LATE_S
         found = ready(self._pending, window.frames[-1][0], end_s)
         if found.hole_s:
@@ -214,7 +208,6 @@ class TargetFreeCalibrator:
 
     def _trim(self) -> None:
         """Memory stays bounded whatever happens."""
-        assert self._buffer is not None
         newest = self._buffer.newest_s
         if self.window is None:
             self._pending = [x for x in self._pending if x[0] > newest - _KEEP_S]
@@ -225,7 +218,6 @@ class TargetFreeCalibrator:
     # ------------------------------------------------------------------ start
     def _try_start(self, flush: bool) -> bool:
         """Attempt to start from what waits; True when there is a window now."""
-        assert self._buffer is not None
         end = self._buffer.settled_s - _LATE_S
         known = self.latest
         self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
@@ -319,7 +311,7 @@ class TargetFreeCalibrator:
     def _with_new_biases(
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior
     ) -> Begun | None:
-        """Start a window that keeps all but the biases, as in another recording; None where it does not fit."""
+        """Start a window that keeps all but the biases, as in another recording; None: it does not fit."""
         if self.latest is None or self._seek_shift:
             return None
         found = self._first.of_another(buffer, frames, known, 0.0)
@@ -337,7 +329,6 @@ class TargetFreeCalibrator:
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, frames: list[Stamped]) -> None:
         """Take images into the window and adjust it; close it when it is long enough."""
-        assert self._buffer is not None
         assert self.carry is not None
         added = window.extend(self._buffer, frames)
         done = {id(f) for _, f in frames[:added]}
@@ -380,14 +371,11 @@ class TargetFreeCalibrator:
 
     def _close(self, fit: Fit, bundle: Bundle) -> None:
         """Carry what the window knows into the next."""
-        window, carry = self.window, self.carry
-        assert window is not None
-        assert carry is not None
+        window, carry = bundle.window, bundle.carry
         if fit.parallax < LEAST_PARALLAX:
             self.latest = carry if self._closed else None
             self._lost(Cause.NO_PARALLAX)
             return
-        assert self._buffer is not None
         anew = self._first.by_columns(self._buffer, bundle, fit)
         if anew is not None:
             bundle, fit = anew
@@ -423,17 +411,20 @@ class TargetFreeCalibrator:
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""
         self._first.anew()
-        self.latest = None
-        self._closed, self._confirmed = 0, False
+        self._drop()
+        self._confirmed = False
         self.evaluator.changed()
-        self.window = self.carry = None
 
     def _start_whole(self) -> None:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
-        self.window = self.carry = self.latest = None
-        self._closed = 0
+        self._drop()
         self.initializer.attempts.anew()
         self.evaluator.lost(Cause.SECOND_AXIS, None, None)
+
+    def _drop(self) -> None:
+        """Keep nothing of what was found."""
+        self.window = self.carry = self.latest = None
+        self._closed = 0
 
     def _lost(
         self, why: Cause, value: float | None = None, *, keep: bool = False, against_s: float = 0.0
@@ -475,8 +466,7 @@ class TargetFreeCalibrator:
         if self.can_go_on:
             self._lost(Cause.NONE, keep=True)
         if not self.can_go_on:
-            self.window = self.carry = self.latest = None
-            self._closed = 0
+            self._drop()
         if self.latest is not None:
             camera, offset_s = self.latest.camera, self._intake.offset_s(self.camera)
             self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + offset_s)
@@ -493,7 +483,7 @@ class TargetFreeCalibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
-        known, newest_s = self.latest, -np.inf if self._buffer is None else self._buffer.newest_s
+        known, newest_s = self.latest, -np.inf if self._intake.buffer is None else self._buffer.newest_s
         estimate = self.evaluator.estimate(known, newest_s, running=self.window is not None, gravity=gravity)
         return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
 

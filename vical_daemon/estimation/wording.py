@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 from vical_daemon.estimation.events import Cause, Event, EventKind
@@ -200,8 +199,9 @@ _LACKS: dict[Lack, Callable[[Guidance], str]] = {
 # -------------------------------------------------------------------------------------------------- events
 def event_text(event: Event) -> str:
     """Return the announcement as one line, with the name of the camera that it concerns."""
-    named = f"{event.camera}: " if event.camera else ""
-    return f"{_LABELS.get(event.kind, '')}{named}{_EVENTS[event.kind](event)}"
+    named, said = f"{event.camera}: " if event.camera else "", _EVENTS[event.kind]
+    text = said.format(_Figure(event)) if isinstance(said, str) else said(event)
+    return f"{_LABELS.get(event.kind, '')}{named}{text}"
 
 
 def event_document(event: Event) -> dict[str, Any]:
@@ -275,46 +275,51 @@ _CAUSES = {
 }
 
 
-def _of(event: Event, factor: float, unit: str, form: str) -> str:
-    """Value and, where known, sigma, each times `factor`."""
-    value = format(factor * (math.nan if event.value is None else event.value), form)
-    if event.sigma is None:
-        return f"{value} {unit}"
-    return f"{value} ± {format(factor * event.sigma, form.replace('+', ''))} {unit}"
+_DEG = 180.0 / math.pi
+_FACTORS = {"mm": 1e3, "ms": 1e3, "us": 1e6, "%": 100.0, "deg": _DEG, "deg/s": _DEG}
+"""Figures in these units over those in SI units; others are as they are."""
 
 
-def _size(event: Event, factor: float, unit: str, form: str) -> str:
-    """The same without the sign."""
-    size = None if event.value is None else abs(event.value)
-    return _of(replace(event, value=size), factor, unit, form)
+class _Figure:
+    """Value of an event and, where known, its sigma, in a format such as ".1f ms"; `size`: without sign."""
+
+    def __init__(self, event: Event, *, size: bool = False) -> None:
+        value = math.nan if event.value is None else event.value
+        self._value, self._sigma = abs(value) if size else value, event.sigma
+
+    def __format__(self, spec: str) -> str:
+        form, unit = spec.split(" ", 1)
+        factor = _FACTORS.get(unit.split()[0], 1.0)
+        value = format(factor * self._value, form)
+        if self._sigma is None:
+            return f"{value} {unit}"
+        return f"{value} ± {format(factor * self._sigma, form.replace('+', ''))} {unit}"
 
 
 def _target_size(event: Event) -> str:
     how = "larger" if (event.value or 0.0) > 0 else "smaller"
-    figure = (
-        f"some {_size(event, 100.0, '%', '.0f')}" if event.sigma is None else _size(event, 100.0, "%", ".2f")
-    )
+    size = _Figure(event, size=True)
+    figure = f"some {size:.0f %}" if event.sigma is None else f"{size:.2f %}"
     return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
 
 
 def _target_ratio(event: Event) -> str:
     how = "further apart" if (event.value or 0.0) > 0 else "closer together"
     return (
-        f"compared with its rows, the target's columns are {_size(event, 100.0, '%', '.0f')} {how} than "
+        f"compared with its rows, the target's columns are {_Figure(event, size=True):.0f %} {how} than "
         "stated: measure both; allowed for from now on"
     )
 
 
 def _accel_lag(event: Event) -> str:
     late = "behind" if (event.value or 0.0) > 0 else "ahead of"
-    return f"the accelerometer is {_size(event, 1e3, 'ms', '.2f')} {late} the gyro: allowed for from now on"
+    return f"the accelerometer is {_Figure(event, size=True):.2f ms} {late} the gyro: allowed for from now on"
 
 
 def _imu_noise(event: Event) -> str:
     than = "worse" if (event.value or 0.0) > 1.0 else "better"
-    times = _of(event, 1.0, "times", ".1f")
     return (
-        f"the IMU predicts images {than} than its noise densities say ({times}): "
+        f"the IMU predicts images {than} than its noise densities say ({_Figure(event):.1f times}): "
         "measure them with `vical allan`"
     )
 
@@ -325,16 +330,15 @@ def _rolling(event: Event) -> str:
         shutter += " that reads columns (a phone held upright does)"
     if event.value is None:
         return f"{shutter}, by how the target is bent in motion: its readout is estimated, too"
-    readout = _of(event, 1e3, "ms", ".1f")
-    return f"{shutter}, by how features move: its readout takes {readout}, and is allowed for"
+    return f"{shutter}, by how features move: its readout takes {_Figure(event):.1f ms}, and is allowed for"
 
 
-def _drift(why: str) -> Callable[[Event], str]:
-    return lambda e: f"{why}, by {_of(e, 1e6, 'us a second', '+.1f')}; it is now estimated too"
+def _cause(event: Event) -> str:
+    return cause_text(event.cause, event.cause_value)
 
 
-def _difference(what: str, factor: float, unit: str, form: str) -> Callable[[Event], str]:
-    return lambda e: f"{what} {_of(e, factor, unit, form)} {cause_text(e.cause)}".rstrip()
+def _difference(what: str) -> Callable[[Event], str]:
+    return lambda e: f"{what.format(_Figure(e))} {cause_text(e.cause)}".rstrip()
 
 
 # before the name of the camera
@@ -346,100 +350,66 @@ _LABELS = {
     EventKind.TIMESHIFT_CHANGED: "changed: ",
     EventKind.LENS_CHANGED: "changed: ",
 }
-_EVENTS: dict[EventKind, Callable[[Event], str]] = {
-    EventKind.BUMPED: lambda e: cause_text(e.cause, e.cause_value),
-    EventKind.STARTED_OVER: lambda e: cause_text(e.cause, e.cause_value),
-    EventKind.STARTED_ANEW: lambda _: "restarted after the change",
-    EventKind.NOT_BUMPED: lambda e: (
-        "the mounting has not changed: the target was moved, or images were wrong "
-        f"(a camera that moved by more than {_of(e, 1e3, 'mm', '.1f')} would show)"
-    ),
-    EventKind.WENT_ON: lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}",
-    EventKind.RESUMED: lambda e: (
-        f"resumed from the state of {_of(e, 1.0, 's', '.1f')} ago: the process was restarted"
-    ),
-    EventKind.CAMERA_MOVED: _difference("moved by", 1e3, "mm", ".1f"),
-    EventKind.CAMERA_TURNED: _difference("turned by", 180.0 / math.pi, "deg", ".2f"),
-    EventKind.TIMESHIFT_CHANGED: _difference("time shift by", 1e3, "ms", "+.2f"),
-    EventKind.LENS_CHANGED: _difference("lens by", 1.0, "px", ".2f"),
-    EventKind.STORED_HOLDS: lambda e: f"the stored calibration holds, by {_of(e, 1.0, 's', '.0f')} of data",
-    EventKind.TIMESHIFT_STEPPED: lambda e: (
-        f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept"
-    ),
-    EventKind.LENS_STEPPED: lambda e: (
-        f"the lens changed, fx by {_of(e, 1.0, 'px', '+.1f')}: fix focus and zoom; "
-        "a lens that is not fixed is estimated again, all else is kept"
-    ),
-    EventKind.BIASES_STEPPED: lambda e: (
-        f"the biases of the IMU stepped, the gyro's by {_of(e, 180.0 / math.pi, 'deg/s', '.2f')}: "
-        "they are found again, all else is kept; does the IMU zero its gyro at rest?"
-    ),
-    EventKind.POSE_LOST: lambda _: (
-        "the target was moved, or the pose was lost: it is found again, the calibration is kept"
-    ),
-    EventKind.CLOCK_DRIFT: _drift(
-        "the time shift drifts: the clocks of camera and IMU run at different rates"
-    ),
-    EventKind.CLOCK_WANDER: lambda e: (
-        "the time shift is not constant: it stepped, or the clocks of camera and IMU changed their "
-        f"rates, which now differ by {_of(e, 1e6, 'us a second', '+.1f')}; the drift is now estimated too"
-    ),
-    EventKind.STAMP_JITTER: lambda e: (
-        f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for"
-    ),
-    EventKind.STAMPED_ON_ARRIVAL: lambda e: (
-        f"its stamps jitter by {_of(e, 1e3, 'ms', '.1f')} but it samples evenly: its images are put on "
-        "an even grid from now on; the calibration starts over"
-    ),
-    EventKind.IMAGES_WANDER: lambda e: (
-        f"whole images move by {_of(e, 1.0, 'px', '.1f')} against the motion of the IMU: switch off "
-        "image stabilisation; lens, camera and board must not move on their own"
-    ),
-    EventKind.STAMPS_STEPPED: lambda e: (
-        f"its stamps stepped by about {_of(e, 1.0, 's', '+.1f')} against those of the IMU"
-    ),
-    EventKind.IMU_CLOCK_SET_BACK: lambda e: (
-        f"the IMU's stamps went back by {_of(e, 1.0, 's', '.1f')}: its clock was set"
-    ),
-    EventKind.IMU_CLOCK_REMAPPED: lambda e: (
-        f"the IMU's stamps moved by {_of(e, 1e3, 'ms', '+.1f')}: its driver mapped the clock again; "
-        "corrected for"
-    ),
-    EventKind.IMU_GAP: lambda e: f"{_of(e, 1.0, 's', '.1f')} without inertial data",
-    EventKind.IMU_REPEATED: lambda e: f"{_of(e, 1.0, 's', '.1f')} in which the IMU repeated one reading",
-    EventKind.IMU_CLIPPED: lambda e: (
-        f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU: move the rig more gently"
-    ),
-    EventKind.IMAGE_GAP: lambda e: f"{_of(e, 1.0, 's', '.1f')} without images",
-    EventKind.IMAGE_REPEATED: lambda e: f"{_of(e, 1.0, 's', '.1f')} in which one image was repeated",
+_EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
+    EventKind.BUMPED: _cause,
+    EventKind.STARTED_OVER: _cause,
+    EventKind.STARTED_ANEW: "restarted after the change",
+    EventKind.NOT_BUMPED: "the mounting has not changed: the target was moved, or images were wrong "
+    "(a camera that moved by more than {:.1f mm} would show)",
+    EventKind.WENT_ON: lambda e: f"continued after: {_cause(e)}",
+    EventKind.RESUMED: "resumed from the state of {:.1f s} ago: the process was restarted",
+    EventKind.CAMERA_MOVED: _difference("moved by {:.1f mm}"),
+    EventKind.CAMERA_TURNED: _difference("turned by {:.2f deg}"),
+    EventKind.TIMESHIFT_CHANGED: _difference("time shift by {:+.2f ms}"),
+    EventKind.LENS_CHANGED: _difference("lens by {:.2f px}"),
+    EventKind.STORED_HOLDS: "the stored calibration holds, by {:.0f s} of data",
+    EventKind.TIMESHIFT_STEPPED: "the time shift stepped by {:+.1f ms}; all else is kept",
+    EventKind.LENS_STEPPED: "the lens changed, fx by {:+.1f px}: fix focus and zoom; "
+    "a lens that is not fixed is estimated again, all else is kept",
+    EventKind.BIASES_STEPPED: "the biases of the IMU stepped, the gyro's by {:.2f deg/s}: they are found "
+    "again, all else is kept; does the IMU zero its gyro at rest?",
+    EventKind.POSE_LOST: "the target was moved, or the pose was lost: it is found again, the "
+    "calibration is kept",
+    EventKind.CLOCK_DRIFT: "the time shift drifts: the clocks of camera and IMU run at different rates, by "
+    "{:+.1f us a second}; it is now estimated too",
+    EventKind.CLOCK_WANDER: "the time shift is not constant: it stepped, or the clocks of camera and IMU "
+    "changed their rates, which now differ by {:+.1f us a second}; the drift is now estimated too",
+    EventKind.STAMP_JITTER: "the stamps of the images jitter by {:.1f ms}; allowed for",
+    EventKind.STAMPED_ON_ARRIVAL: "its stamps jitter by {:.1f ms} but it samples evenly: its images are put "
+    "on an even grid from now on; the calibration starts over",
+    EventKind.IMAGES_WANDER: "whole images move by {:.1f px} against the motion of the IMU: switch off "
+    "image stabilisation; lens, camera and board must not move on their own",
+    EventKind.STAMPS_STEPPED: "its stamps stepped by about {:+.1f s} against those of the IMU",
+    EventKind.IMU_CLOCK_SET_BACK: "the IMU's stamps went back by {:.1f s}: its clock was set",
+    EventKind.IMU_CLOCK_REMAPPED: "the IMU's stamps moved by {:+.1f ms}: its driver mapped the clock again; "
+    "corrected for",
+    EventKind.IMU_GAP: "{:.1f s} without inertial data",
+    EventKind.IMU_REPEATED: "{:.1f s} in which the IMU repeated one reading",
+    EventKind.IMU_CLIPPED: "{:.1f %} of the readings are at the range of the IMU: move the rig more gently",
+    EventKind.IMAGE_GAP: "{:.1f s} without images",
+    EventKind.IMAGE_REPEATED: "{:.1f s} in which one image was repeated",
     EventKind.IMU_NOISE: _imu_noise,
-    EventKind.IMU_INTRINSICS: lambda e: (
-        f"scale or alignment of the IMU is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
-    ),
+    EventKind.IMU_INTRINSICS: "scale or alignment of the IMU is off, by {:.2f %}: allowed for from now on",
     EventKind.ACCEL_LAG: _accel_lag,
     EventKind.ACCEL_POSITIONS: lambda e: (
         "the axes of the accelerometer are not in one place (size effect), by "
-        f"{_size(e, 1e3, 'mm', '.1f')}: allowed for from now on"
+        f"{_Figure(e, size=True):.1f mm}: allowed for from now on"
     ),
     EventKind.TARGET_SIZE: _target_size,
     EventKind.TARGET_RATIO: _target_ratio,
-    EventKind.TARGET_SHAPE: lambda e: (
-        f"the target differs from its file by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
-        "its shape is estimated from now on"
-    ),
-    EventKind.FIXED_LENS: lambda e: (
-        f"the fixed lens is not this camera's: points appear {_of(e, 1.0, 'px', '.1f')} (RMS) from where "
-        "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated"
-    ),
+    EventKind.TARGET_SHAPE: "the target differs from its file by {:.2f mm} at its edges: "
+    "its shape is estimated from now on",
+    EventKind.FIXED_LENS: "the fixed lens is not this camera's: points appear {:.1f px} (RMS) from where "
+    "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated",
     EventKind.ROLLING_SHUTTER: _rolling,
     EventKind.ROLLING_COLUMNS: _rolling,
-    EventKind.LENS_TERM_MISSING: lambda _: (
-        "the lens needs one term more than radtan has: give it distortion_model: plumb_bob"
-    ),
+    EventKind.LENS_TERM_MISSING: "the lens needs one term more than radtan has: give it "
+    "distortion_model: plumb_bob",
     EventKind.DEVICE_REPLACED: lambda e: e.said,
     EventKind.ESTIMATOR_RESTARTED: lambda e: e.said,
     EventKind.OTHER: lambda e: e.said,
 }
+"""What is said of each kind of event, with its figure where a text has {}."""
 
 
 def _listed(words: Iterable[Axis | str]) -> str:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.init.accelerometer_check import explain_accelerometer
 from vical_daemon.estimation.measurements import CameraPrior
-from vical_daemon.estimation.temporal.td_icp import REFUSED, td_icp
-from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.logs import Stream
 from vical_daemon.offline.calibration_job import Job
 from vical_daemon.offline.errors import InputError

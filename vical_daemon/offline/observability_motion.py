@@ -12,7 +12,9 @@ from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.tools.observability import Motion, Setup
 from vical_daemon.logs import open_recording
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore

@@ -62,6 +62,11 @@ def test_every_cause_has_a_text(cause):
             "cam0: the time shift stepped by +20.1 ms; all else is kept",
         ),
         (
+            Event(EventKind.BIASES_STEPPED, value=0.0148),
+            "the biases of the IMU stepped, the gyro's by 0.85 deg/s: they are found again, all else is kept; "
+            "does the IMU zero its gyro at rest?",
+        ),
+        (
             Event(EventKind.CLOCK_DRIFT, "cam0", -5e-5, 1e-6),
             "cam0: the time shift drifts: the clocks of camera and IMU run at different rates, "
             "by -50.0 ± 1.0 us a second; it is now estimated too",

@@ -112,6 +112,16 @@ def quat_from_rotvec(rotvec: FloatArray) -> FloatArray:
     return q
 
 
+def turn_between(q_a: FloatArray, q_b: FloatArray) -> FloatArray:
+    """Return the rotation vectors (angle 0 to pi, rad) that lead from orientations to others, in their frame.
+
+    Args:
+        q_a: From, quaternions w x y z, shape (..., 4).
+        q_b: To, likewise.
+    """
+    return rotvec_from_quat(quat_multiply(quat_conjugate(q_a), q_b))
+
+
 def rotvec_from_quat(q: FloatArray) -> FloatArray:
     """Return rotation vectors (angle 0 to pi, rad) of quaternions w x y z; q and -q give the same.
 

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.inertial.faulty_readings import Six
-
-_BLOCK_S = 5.005e-3  # a block may be so long: readings of up to 333 Hz stay as they are; stamps have jitter
+from vical_daemon.estimation.inertial.imu_buffer import BLOCK_S
 
 
 class Mean(NamedTuple):
@@ -37,7 +36,7 @@ class BlockMeans:
         """Take a reading; return the mean of the block that it completes, or None."""
         interval_s, self._before_s = t_s - self._before_s, t_s
         self._block.append(Mean(t_s, six, clipping_sigma))
-        return self.rest() if t_s - self._block[0].t_s + 2.0 * interval_s > _BLOCK_S else None
+        return self.rest() if t_s - self._block[0].t_s + 2.0 * interval_s > BLOCK_S else None
 
     def rest(self) -> Mean | None:
         """End the block, and return its mean; None where it is empty."""

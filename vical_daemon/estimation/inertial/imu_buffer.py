@@ -21,7 +21,8 @@ GAP_S = 0.05
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
-_HALF_BLOCK_S = 2.5e-3  # of `BlockMeans`
+BLOCK_S = 5.005e-3
+"""A block of `BlockMeans` may be so long: readings of up to 333 Hz stay as they are; stamps have jitter."""
 _ROOM = 4096  # readings for which there is room at first
 _USUAL = 201  # samples whose median interval is the usual one
 
@@ -138,7 +139,7 @@ class ImuBuffer:
         if not len(self):
             return
         row = self._start + int(np.argmin(np.abs(self.rows[:, 0] - t_s)))
-        if abs(self._rows[row, 0] - t_s) < _HALF_BLOCK_S:
+        if abs(self._rows[row, 0] - t_s) < 0.5 * BLOCK_S:
             for column in (self._rows, self._clipping_sigma):
                 if column is not None:
                     column[row : self._stop - 1] = column[row + 1 : self._stop]
@@ -178,29 +179,8 @@ class ImuBuffer:
 
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
         """Return the readings between two instants with interpolated ends; None where not covered."""
-        rows = self.rows
-        if not len(rows) or from_s < rows[0, 0] or to_s > rows[-1, 0] or to_s < from_s:
-            return None
-        t = rows[:, 0]
-        low = int(t.searchsorted(from_s, side="right"))
-        high = int(t.searchsorted(to_s, side="left"))
-        first, last = max(low - 1, 0), min(max(high, 1), len(rows) - 1)
-        if last == first:
-            only = np.repeat(rows[first][None], 2, axis=0)
-            return ImuSegment(np.array([from_s, to_s]), only[:, 1:4], only[:, 4:], 0.0)
-        inside = rows[first : last + 1]
-        slope = _slopes(rows[max(first - 2, 0) : last + 3], first - max(first - 2, 0), len(inside))
-        ends = np.array([from_s, to_s])
-        k = np.array([0, len(inside) - 2])
-        value, change = _hermite(inside, slope, ends, k)
-        middle = slice(low - first, high - first)
-        cut = np.concatenate([value[:1], inside[middle, 1:], value[1:]])
-        rise = np.concatenate([change[:1], slope[middle], change[1:]])
-        times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
-        gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
-        at = np.arange(low - 1, high + 1) - first
-        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, ends, np.array([0, len(times)]))
-        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], sigma)
+        found = self.intervals(np.array([from_s, to_s]))
+        return None if found is None else found[0]
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -221,14 +201,15 @@ class ImuBuffer:
         first = min(max(int(after[0]) - 1, 0), len(rows) - 2)
         last = max(int(before[-1]), first + 1)
         slope = _slopes(rows[max(first - 2, 0) : last + 3], first - max(first - 2, 0), last + 1 - first)
-        k = np.clip(after - 1 - first, 0, last - first - 1)
+        k = np.minimum(np.maximum(after - 1 - first, 0), last - first - 1)
         value, change = _hermite(rows[first : last + 1], slope, t_s, k)
-        begin = np.concatenate([[0], np.cumsum(inside + 2)])
-        at = np.arange(begin[-1]) + np.repeat(after[:-1] - begin[:-1] - 1, inside + 2)
-        nodes, rise = np.take(rows, at, axis=0, mode="clip"), np.take(slope, at - first, axis=0, mode="clip")
+        begin = np.zeros(len(t_s), np.intp)
+        (inside + 2).cumsum(out=begin[1:])
+        at = np.arange(begin[-1]) + (after[:-1] - begin[:-1] - 1).repeat(inside + 2)
+        nodes, rise = rows.take(at, axis=0, mode="clip"), slope.take(at - first, axis=0, mode="clip")
         for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
             nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
-        gap = float(np.diff(t[first : last + 1]).max())
+        gap = float((t[first + 1 : last + 1] - t[first:last]).max())
         sigma = self._clipping_sigma_at(slice(first, last + 1), at - first, k, t_s, begin)
         segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], sigma)
         return segment, begin[:-1]
@@ -303,10 +284,8 @@ class _Turns:
         h = (self._t[k + 1] - self._t[k])[:, None]
         u = (t_s - self._t[k])[:, None] / h
         A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._rate[k + 1] - self._rate[k]
-        mean = self._rate[k] + u * (
-            0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
-        )
-        return np.asarray(self._sum[k] + u * h * mean)
+        bent = 0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
+        return np.asarray(self._sum[k] + u * h * (self._rate[k] + u * bent))
 
 
 def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:

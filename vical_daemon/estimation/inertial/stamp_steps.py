@@ -19,8 +19,9 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 LEARN = 20  # readings by which the usual interval is known, and how well the motion is predicted
-_LEAST_S = 1e-4  # smaller steps are like jitter
-_EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by a device's clock
+_LEAST_S = 1e-4
+"""Smaller steps are like jitter. Stamps that deviate by half as much from an even grid were not made by a
+device's clock."""
 _FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval
 _MOST = 0.55  # of an interval
 _SETTLED = 4  # readings after which a step is one: a single late stamp is followed by a short interval
@@ -67,7 +68,7 @@ class StampSteps:
 
     def _see_rate(self, interval_s: float) -> None:
         """Notice another rate; what was taken for steps since it began is taken back."""
-        alike, self._interval_s = abs(interval_s - self._interval_s) < _EVEN_S, interval_s
+        alike, self._interval_s = abs(interval_s - self._interval_s) < 0.5 * _LEAST_S, interval_s
         other = interval_s > _LEAST_S <= abs(interval_s - self._period_s)
         self._alike = self._alike + 1 if alike and other else 0
         spread = abs(interval_s / self._period_s - _SPREAD) < _SPREAD_OFF
@@ -81,7 +82,7 @@ class StampSteps:
         size_s = abs(deviation_s)
         if deviation_s > _MOST * self._period_s:  # readings are missing
             return
-        if self._largest_s < _EVEN_S and _LEAST_S < size_s < _MOST * self._period_s:
+        if self._largest_s < 0.5 * _LEAST_S and _LEAST_S < size_s < _MOST * self._period_s:
             if not self._since:
                 self._before_s, self._since = self.total_s, _SETTLED
             self.total_s += deviation_s

@@ -19,19 +19,25 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import (
-    ACCEL_BIAS_SIGMA_MPS2,
-    GYRO_BIAS_SIGMA_RPS,
-    WINDOW_START,
-)
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.temporal.rotation_curves import running_integral
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
 _STEP_S = 0.01  # between windows, a fortieth of their length
 PRIORS = 9
-"""Rows for these three vectors."""
+"""Rows of what is known before: lever arm, accelerometer bias and gyro bias."""
 _MIN_WINDOWS = 12  # 36 equations for a rotation and three vectors
+_COARSE_S = (
+    0.02  # grid of time shifts: a hand's acceleration changes over 0.1 s; a fifth of it about the best
+)
+_APART_S = 0.25  # another delay this far away must fit worse by the contrast
+_MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
+ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
+"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
+_DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
+_ALIGNED = so3.signed_permutations()
+_STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]
 
 
 @dataclass(frozen=True)
@@ -155,14 +161,6 @@ def _other_unknowns(
     return out
 
 
-_COARSE_S, _FINE_S = 0.02, 0.004  # grids of time shifts; a hand's acceleration changes over 0.1 s
-_APART_S = 0.25  # another delay this far away must fit worse by the contrast
-_MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
-ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
-"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
-_DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
-
-
 @dataclass(frozen=True)
 class Alignment:
     """The best mounting and delay by accelerations and turns together.
@@ -213,12 +211,13 @@ def align(path: CameraPath, imu_rows: FloatArray, shifts_s: tuple[float, float])
     best = int(np.argmin(costs))
     apart = np.abs(coarse - coarse[best]) > _APART_S
     contrast = float(np.min(costs[apart]) / max(costs[best], 1e-9)) if apart.any() else 1.0
-    fine = coarse[best] + np.arange(-10, 11) * _FINE_S
+    step_s = _COARSE_S / 5.0
+    fine = coarse[best] + np.arange(-10, 11) * step_s
     costs, Rs = _costs(evidence, imu_rows, fine)
     at = int(np.clip(np.argmin(costs), 1, len(fine) - 2))
     low, middle, high = costs[at - 1 : at + 2]
-    bend = max(float(low - 2.0 * middle + high) / _FINE_S**2, 1e-9)
-    shift = float(fine[at] + np.clip((low - high) / (2.0 * bend * _FINE_S), -_FINE_S, _FINE_S))
+    bend = max(float(low - 2.0 * middle + high) / step_s**2, 1e-9)
+    shift = float(fine[at] + np.clip((low - high) / (2.0 * bend * step_s), -step_s, step_s))
     scale = max(float(middle) / evidence.dof, 1.0)
     shift_sigma = float(np.sqrt(2.0 * scale / bend))
     return _alignment(evidence, imu_rows, Rs[at], scale, np.eye(3), (shift, shift_sigma, contrast))
@@ -346,7 +345,3 @@ def _tangent(R: FloatArray) -> FloatArray:
     """Derivative of vec(exp(w) R) by w at 0, shape (..., 9, 3)."""
     generators = so3.hat(np.eye(3))
     return np.stack([(generators[m] @ R).reshape(*R.shape[:-2], 9) for m in range(3)], axis=-1)
-
-
-_ALIGNED = so3.signed_permutations()
-_STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]

@@ -8,6 +8,8 @@ from vical_daemon.estimation.measurements import LEAST_POINTS, PointsFrame
 
 LONG_S = 8.0  # of data: much for a start; more of them would not make it better
 _GROWTH, _MOST_S = 1.25, 4.0  # each pause over the one before; the longest
+MOVED_PX = 1.0  # at 500 px of focal length 0.1 deg, a tenth of the rotation that a start must know
+_REST_S = 1.0  # so long without moving that far is rest: slower than any rotation that shows a time shift
 
 
 class Attempts:
@@ -34,10 +36,6 @@ class Attempts:
         self._next_s = t_s + self._pause_s
         self._pause_s = min(_GROWTH * self._pause_s, _MOST_S)
         self.count += 1
-
-
-MOVED_PX = 1.0  # at 500 px of focal length 0.1 deg, a tenth of the rotation that a start must know
-_REST_S = 1.0  # so long without moving that far is rest: slower than any rotation that shows a time shift
 
 
 class RestDetector:

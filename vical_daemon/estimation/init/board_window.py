@@ -34,12 +34,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.imu_scale import APART, numbers_of
-from vical_daemon.estimation.model.inertial_links import (
-    DONE,
-    RELINK_S,
-    PreintegratedLinks,
-    make_links,
-)
+from vical_daemon.estimation.model.inertial_links import DONE, RELINK_S, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.rates import SLOPE_S, Rates
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import BIASES, GRAVITY, MOTION, State

@@ -24,22 +24,23 @@ from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.numbering import numbered_differently
-from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
-from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
+from vical_daemon.estimation.init.readout_start import (
+    at_middle_row,
+    lens_fit,
+    likely_axis,
+    looks_rolling,
+    readout,
+)
 from vical_daemon.estimation.init.spacing_ratio import spacing_ratio, stretched
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
-from vical_daemon.estimation.measurements import (
-    CalibrationOptions,
-    CameraPrior,
-    FloatArray,
-    Frames,
-)
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, Frames
 from vical_daemon.estimation.model.state import CameraState, Layout
-from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
+from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about

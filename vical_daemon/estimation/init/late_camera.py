@@ -20,8 +20,8 @@ from vical_daemon.estimation.init.closed_form import StartData
 from vical_daemon.estimation.init.initial_filter import with_camera
 from vical_daemon.estimation.init.initializer import MIN_SPAN_S, Attempt, frames_from
 from vical_daemon.estimation.init.numbering import late_numbered_differently
+from vical_daemon.estimation.init.readout_start import at_middle_row
 from vical_daemon.estimation.init.rig_model import RigModel
-from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import TargetPose, usable_poses
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, Frames, PointsFrame

@@ -6,7 +6,7 @@ With attitudes and the gyro's bias known, from images of a target or from the gy
 
 with D_k the double integral of the rotated specific force, and A_k = [T, T^2/2, R_k, -B_k], B_k the double
 integral of the rotation. All starts solve parts of this for z: with a target (here), without one
-(`track_start`), after a gap (`motion_restart`), for another recording (`recording_start`). [Dong-Si and
+(`track_start`), after a gap (`motion_restart`), for another recording. [Dong-Si and
 Mourikis, "Estimator initialization in vision-aided inertial navigation with unknown camera-IMU calibration",
 2012]
 """

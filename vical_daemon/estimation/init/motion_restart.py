@@ -1,4 +1,6 @@
-"""The motion anew from a few images, with the calibration as it is known: after gaps and lost poses.
+"""The motion anew from a few images, with the calibration as it is known.
+
+After gaps and lost poses (`MotionRestart`), and at the begin of another recording (`RecordingStart`).
 
 Pose from the target; velocity linear in positions: `LinearMotion` with everything but p_0 and v_0 known.
 
@@ -16,27 +18,46 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import LEAST_IMAGES, SPEED, LinearMotion, linear_start
+from vical_daemon.estimation.init.linear_start import (
+    BIAS,
+    GRAVITY,
+    LEAST_IMAGES,
+    SPEED,
+    LinearMotion,
+    LinearStart,
+    linear_start,
+)
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
-from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
+from vical_daemon.estimation.model.priors import (
+    ACCEL_BIAS_SIGMA_MPS2,
+    AGAIN_SIGMAS,
+    GRAVITY_SIGMA_RAD,
+    GYRO_BIAS_SIGMA_RPS,
+)
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
     POSITION,
     VELOCITY,
+    BiasStart,
     CameraState,
     MotionStart,
     State,
 )
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
-_WIDE_RAD = 0.03
-"""Sigma of attitude up to which images are near to linear, rad."""
-_WIDE_SHARE = 0.03
-"""Likewise of position, of the distance to the target."""
+_WIDE = 0.03
+"""Sigma up to which images are near to linear: of attitude, rad; of position, over the target's distance."""
 _WAIT_S = 2.0  # for an image that shows the pose so well: a board comes back into view within seconds, or not
 _WIDE_MPS = 0.3  # of velocity: ten times what a board in full view gives
+_RECORDING_IMAGES = 8  # of another recording, with poses: fewer do not show which of them are wrong
+_RECORDING_S = 1.5
+"""Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
+_MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now
+_POSITION_SIGMA_M = 2e-3  # of a pose of the target, m: weighs the prior of the bias
 
 
 class Poses(NamedTuple):
@@ -83,11 +104,11 @@ class MotionRestart:
             state: With the calibration as it is known.
             buffer: Inertial readings.
         """
+        t_s = t_cam_s + _camera(state, frame).timeshift_s
         if self.frames:
             before_s = self.frames[-1][0] + _camera(state, self.frames[-1][1]).timeshift_s
-        t_s = t_cam_s + _camera(state, frame).timeshift_s
-        if self.frames and (t_s < before_s or buffer.gap_within(before_s, t_s)):
-            self.frames, self._seen = [], []
+            if t_s < before_s or buffer.gap_within(before_s, t_s):
+                self.frames, self._seen = [], []
         if t_s < buffer.oldest_s or buffer.gap_within(t_s, t_s):
             return
         seen = pose_of(frame, t_cam_s, _camera(state, frame), self._target)
@@ -164,12 +185,18 @@ class MotionRestart:
 
 def _turned(t_s: float, R: FloatArray, f: CalibrationFilter, buffer: ImuBuffer) -> FloatArray | None:
     """How the attitude `R` by an image at `t_s` differs from that by the imu since the motion was lost."""
+    there = ahead(f, buffer, t_s)
+    return None if there is None else np.asarray(R @ there.state.R_world_imu.T)
+
+
+def ahead(f: CalibrationFilter, buffer: ImuBuffer, t_s: float) -> CalibrationFilter | None:
+    """A copy of a filter at a later instant, s, by the readings alone; None where these do not reach."""
     segment = buffer.segment(f.state.t_s, t_s)
     if segment is None:
         return None
-    ahead = f.copy()
-    ahead.predict(segment)
-    return np.asarray(R @ ahead.state.R_world_imu.T)
+    out = f.copy()
+    out.predict(segment)
+    return out
 
 
 def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> FloatArray:
@@ -182,8 +209,8 @@ def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> F
     arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
     seen_rad, seen_m = _sigmas_seen(seen, f)
     out = np.empty(9)
-    out[ATTITUDE] = max(_WIDE_RAD, AGAIN_SIGMAS * turn, seen_rad)
-    out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), AGAIN_SIGMAS * arm, seen_m)
+    out[ATTITUDE] = max(_WIDE, AGAIN_SIGMAS * turn, seen_rad)
+    out[POSITION] = max(_WIDE * _distance_m(seen.p_target_cam), AGAIN_SIGMAS * arm, seen_m)
     out[VELOCITY] = max(_WIDE_MPS, AGAIN_SIGMAS * arm / span_s, seen_m / span_s)
     return out
 
@@ -215,14 +242,12 @@ def motion_is_lost(
         return True
     if t_s < f.state.t_s + IMAGE_GAP_S:
         return False
-    segment = buffer.segment(f.state.t_s, t_s)
-    if segment is None:
+    there = ahead(f, buffer, t_s)
+    if there is None:
         return False
-    ahead = f.copy()
-    ahead.predict(segment)
-    sigmas = ahead.sigmas()
+    sigmas = there.sigmas()
     turn, away = float(sigmas[ATTITUDE].max()), float(sigmas[POSITION].max())
-    if _near(turn, away, _distance_m(ahead.state.p_world_imu)):
+    if _near(turn, away, _distance_m(there.state.p_world_imu)):
         return False
     seen = pose_of(frame, t_cam_s, camera, target)
     if seen is None:
@@ -233,7 +258,7 @@ def motion_is_lost(
 
 def _near(turn_rad: float, away_m: float, distance_m: float) -> bool:
     """Whether images are near to linear about a pose, by its sigmas and the distance to the target."""
-    return turn_rad <= _WIDE_RAD and away_m <= _WIDE_SHARE * distance_m
+    return turn_rad <= _WIDE and away_m <= _WIDE * distance_m
 
 
 def _distance_m(p_target_cam: FloatArray) -> float:
@@ -243,3 +268,74 @@ def _distance_m(p_target_cam: FloatArray) -> float:
 
 def _camera(state: State, frame: PointsFrame) -> CameraState:
     return state.cameras[frame.camera]
+
+
+class RecordingStart(MotionRestart):
+    """Collects the first images of another recording until its motion can start from them.
+
+    Gravity and the biases are unknown, too: the board may stand elsewhere, the imu was switched off. With the
+    calibration known, all are linear in poses of the target over a second or two; the gyro's bias is by what
+    its turns differ from those seen.
+    """
+
+    def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
+        """See `MotionRestart.take`; images of long ago are left out."""
+        super().take(frame, t_cam_s, state, buffer)
+        self.drop_before(t_cam_s - _MOST_S)
+
+    def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
+        """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
+        state = f.state
+        poses = self._enough_poses(state, _RECORDING_IMAGES, _RECORDING_S)
+        if poses is None:
+            return None
+        gyro_bias = _gyro_bias(buffer, poses.t_s, poses.R)
+        if gyro_bias is None:
+            return None
+        found = LinearMotion.between(buffer, poses.t_s, poses.R, gyro_bias)
+        if found is None:
+            return None
+        start = _linear(found, poses.p, state)
+        wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
+        biases = BiasStart(
+            gyro_bias,
+            start.accel_bias,
+            start.gravity,
+            GYRO_BIAS_SIGMA_RPS,
+            ACCEL_BIAS_SIGMA_MPS2,
+            GRAVITY_SIGMA_RAD,
+        )
+        return MotionStart(
+            float(poses.t_s[0]), poses.R[0], start.p_world_cam, start.v_world_imu, wide, 0.0, biases
+        )
+
+    def gyro_bias(self, state: State, buffer: ImuBuffer) -> FloatArray:
+        """Bias of the gyro by the images so far, rad/s, shape (3,); the state's where they say nothing."""
+        poses = self._enough_poses(state, 3, 0.0)
+        found = None if poses is None else _gyro_bias(buffer, poses.t_s, poses.R)
+        return state.gyro_bias if found is None else found
+
+
+def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> FloatArray | None:
+    """Bias of the gyro by the attitudes seen, rad/s, shape (3,); None where readings are missing.
+
+    log(dR_gyro' dR_seen) = -integral of dR(t)' b dt, with dR from t to the end of each interval.
+    """
+    if t_s[0] < buffer.oldest_s or t_s[-1] > buffer.newest_s:
+        return None
+    curve = GyroCurve.integrate(buffer.rows[:, 0], buffer.rows[:, 1:4], np.zeros(3))
+    R, _, integral = curve.at(t_s)
+    back, turned = np.swapaxes(R[1:], 1, 2) @ R[0], R[0].T @ (integral[1:] - integral[0])
+    misses = so3.log(back @ R_world_imu[0].T @ R_world_imu[1:])
+    rows = np.concatenate([back @ turned, back], axis=2)  # the error of the first attitude is unknown, too
+    x, *_ = np.linalg.lstsq(rows.reshape(-1, 6), -misses.ravel(), rcond=None)
+    return np.asarray(x[:3])
+
+
+def _linear(motion: LinearMotion, p_world_imu: FloatArray, state: State) -> LinearStart:
+    """Motion at the first pose, gravity of its known length, and the accelerometer's bias."""
+    sigma, known = np.full(len(p_world_imu), _POSITION_SIGMA_M), np.zeros(12)
+    known[BIAS] = state.accel_bias
+    found = linear_start(motion, p_world_imu, sigma, unknown=[SPEED, GRAVITY, BIAS], known=known)
+    known[GRAVITY] = found.gravity * (np.linalg.norm(state.gravity) / np.linalg.norm(found.gravity))
+    return linear_start(motion, p_world_imu, sigma, unknown=[SPEED, BIAS], known=known)

@@ -15,6 +15,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry.so3 import nearest_rotation
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.motion_restart import ahead
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import State
@@ -78,12 +79,10 @@ def late_numbered_differently(
         state: With the attitude by its images, not before the filter's.
         buffer: Inertial readings; where some are missing in between, nobody knows: None.
     """
-    segment = buffer.segment(known.state.t_s, state.t_s)
-    if segment is None or buffer.gap_within(known.state.t_s, state.t_s):
+    there = None if buffer.gap_within(known.state.t_s, state.t_s) else ahead(known, buffer, state.t_s)
+    if there is None:
         return None
-    ahead = known.copy()
-    ahead.predict(segment)
-    angle_rad = _angle(ahead.state.R_world_imu.T @ state.R_world_imu)
+    angle_rad = _angle(there.state.R_world_imu.T @ state.R_world_imu)
     first = next(other for other in known.state.cameras if other not in known.absent)
     return Turned(first, name, angle_rad) if angle_rad > _TURNED_RAD else None
 

@@ -23,7 +23,6 @@ from vical_daemon.estimation.significance import SURE_SIGMAS
 _TRIED = (-0.1, -0.05, 0.05, 0.1)  # logarithms of ratios; with another one a lens may run away
 _FAR = 0.2  # of the best of these no step should lead so far
 _ROUNDS = 4  # lens and ratio in turn; the squared residuals are nearly a parabola of its logarithm
-_DONE = EXPECTED  # a step that moves the target by less than the filter allows for in any case
 _LEAST = SURE_SIGMAS * 2.0 * EXPECTED
 """Logarithm of the least ratio: one side longer and the other shorter by what the filter does not expect."""
 
@@ -60,7 +59,7 @@ def spacing_ratio(
     fit = fits[found]
     for _ in range(_ROUNDS):
         step, bend = _step(fit, lens, stretched(target, math.exp(found)))
-        if abs(step) < _DONE:
+        if abs(step) < EXPECTED:  # it moves the target by less than the filter allows for in any case
             surely = found**2 * bend > SURE_SIGMAS**2 * fit.squares / fit.numbers
             return math.exp(found) if surely and abs(found) > _LEAST else 1.0
         if abs(step) > _FAR:

@@ -22,12 +22,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.noise.shared_errors import (
-    JITTERS_S,
-    SHIFTS_PX,
-    WAYS,
-    SharedErrors,
-)
+from vical_daemon.estimation.noise.shared_errors import JITTERS_S, SHIFTS_PX, WAYS, SharedErrors
 from vical_daemon.estimation.noise.variance_components import of_window
 from vical_daemon.estimation.significance import SURE_SIGMAS
 

@@ -6,12 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import ROLLING, Event, EventKind
 from vical_daemon.estimation.measurements import ROWS
-from vical_daemon.estimation.model.priors import (
-    ENTRY_SIGMA,
-    KNOWN_OFF_SIGMA,
-    OFF,
-    SURE,
-)
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, OFF, SURE
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
@@ -61,13 +56,7 @@ class AlternativeModels:
         stamp_sigma_s: How well the imu's driver knows its device's clock, s.
     """
 
-    def __init__(
-        self,
-        layout: Layout,
-        *,
-        asked: frozenset[str],
-        rolling: bool,
-    ) -> None:
+    def __init__(self, layout: Layout, *, asked: frozenset[str], rolling: bool) -> None:
         (self._camera,) = layout.cameras
         self.lens = layout.held.get(self._camera)
         self._off = asked & {model_selection.IMU, model_selection.LAG, model_selection.SIZE_EFFECT}

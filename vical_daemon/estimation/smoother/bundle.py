@@ -23,11 +23,7 @@ from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left
-from vical_daemon.estimation.smoother.marginal_prior import (
-    MarginalPrior,
-    calibration_difference,
-    carried_out,
-)
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
 from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
@@ -39,6 +35,10 @@ _LEAST_LANDMARKS = 8  # as many as the eight-point algorithm needs
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
+_MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
+"""What a step changes of a window."""
+_MEMORY = 25  # images over which an error of the pixels may last
+LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
 
 
 class Fit(NamedTuple):
@@ -113,10 +113,6 @@ class _Present:
         """A step failed. The second time the factor is larger: from `_DAMPING` it is a long way up."""
         self.damping *= 10.0 if self.failures == 0 else 100.0
         self.failures += 1
-
-
-_MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
-"""What a step changes of a window."""
 
 
 class Bundle:
@@ -372,9 +368,6 @@ def _in_place(H: FloatArray) -> tuple[FloatArray, int]:
     return root, int(info)
 
 
-_MEMORY = 25  # images over which an error of the pixels may last
-
-
 def correlation(e: FloatArray, seen: Seen) -> float:
     """By how much the variance of a track's mean error exceeds that of white noise: 1 + 2 sum rho_k.
 
@@ -385,9 +378,7 @@ def correlation(e: FloatArray, seen: Seen) -> float:
     e = e * huber_weight(np.sqrt((e**2).sum(axis=1, keepdims=True)), HUBER)
     variance = float((e**2).mean())
     total = 1.0
-    for k in range(1, _MEMORY):
-        if len(e) <= k:
-            break
+    for k in range(1, min(_MEMORY, len(e))):
         same = (seen.landmark[k:] == seen.landmark[:-k]) & (seen.frame[k:] - seen.frame[:-k] == k)
         count = int(same.sum())
         if count < 50:
@@ -397,9 +388,6 @@ def correlation(e: FloatArray, seen: Seen) -> float:
             break
         total += 2.0 * rho
     return total
-
-
-LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
 
 
 def parallax(window: Window, seen: Seen, noise: ImageNoise) -> float:

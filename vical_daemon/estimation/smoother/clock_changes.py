@@ -21,14 +21,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import CLOCK_CHANGES_HZ, OFF, SKEW_SIGMA, STEP_SIGMA_S
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.selection.clock_drift import stamps_variance
-from vical_daemon.estimation.smoother.marginal_prior import (
-    BIASES,
-    CORE,
-    SPEED,
-    TILT,
-    MarginalPrior,
-    root_of,
-)
+from vical_daemon.estimation.smoother.marginal_prior import BIASES, CORE, SPEED, TILT, MarginalPrior, root_of
 
 REMEMBERED = 8
 """Jumps that a carry holds: with ages that double, enough for ten minutes."""
@@ -140,9 +133,8 @@ def what_happened(
     # likelihood of the data, integrated over what is not zero
     B, C, m = _conditioned(one + data[:, :-1], data[:, -1], [c.free for c in found])
     logs = np.log([c.probability for c in found]) + 0.5 * np.linalg.slogdet(C)[1]
-    logs += 0.5 * np.log(np.maximum((B**2).sum(axis=1), 1.0)).sum(
-        axis=1
-    )  # a pair is known to half a variance
+    pairs = np.maximum((B**2).sum(axis=1), 1.0)  # a pair is known to half a variance
+    logs += 0.5 * np.log(pairs).sum(axis=1)
     logs += 0.5 * np.einsum("hi,hij,hj->h", m, np.linalg.inv(C), m)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()

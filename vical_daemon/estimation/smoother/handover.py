@@ -7,12 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import (
-    CameraPrior,
-    FloatArray,
-    ImuNoise,
-    PointsFrame,
-)
+from vical_daemon.estimation.measurements import CameraPrior, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
@@ -117,7 +112,6 @@ def next_window(window: Window, carry: MarginalPrior) -> Window:
     """A window that begins at the last image of this one; that image has been used."""
     t, last = window.frames[-1]
     none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
-    empty = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     return Window(
         carry.camera,
         window.noise,
@@ -128,7 +122,7 @@ def next_window(window: Window, carry: MarginalPrior) -> Window:
         carry.bias[None].copy(),
         PreintegratedLinks.none(6 + len(window.imu)),
         carry.camera.timeshift_s,
-        empty,
+        Landmarks.none(),
         gravity=window.gravity,
         imu=window.imu,
         jumps=carry.jumps.copy(),

@@ -121,9 +121,8 @@ class Problem:
         self.own = 0 if carry.layout.camera.intrinsics is None else len(window.own_lens)
         uv = np.concatenate([frame.uv_px for _, frame in window.frames])
         seen = patches_seen(uv, carry.camera.resolution)
-        self.lens_root = (
-            patches(carry.camera, seen) / noise.lens_px
-        )  # of the information in the prior of the own lens
+        # of the information in the prior of the own lens
+        self.lens_root = patches(carry.camera, seen) / noise.lens_px
 
     def order(self) -> Order:
         """Places of the unknowns."""

@@ -25,8 +25,13 @@ from vical_daemon.estimation.model import imu_scale
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
-from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
-from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
+from vical_daemon.estimation.smoother.track_start import (
+    ArmPrior,
+    NoStartError,
+    TrackStart,
+    mounting_about,
+    still_axis,
+)
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S

@@ -22,8 +22,13 @@ from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
-from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.status.evaluator import (
+    Evaluator,
+    Verdict,
+    lacking_verdict,
+    lens_known,
+    lens_verdict,
+)
 from vical_daemon.estimation.wording import cause_text
 
 _ENOUGH_WINDOWS = 2  # the first one shows only what it was fitted to
@@ -44,13 +49,7 @@ class TargetFreeStatus(Evaluator):
         rolling: The camera is configured with a rolling shutter, or its readout is asked for.
     """
 
-    def __init__(
-        self,
-        options: CalibrationOptions,
-        layout: Layout,
-        *,
-        rolling: bool = False,
-    ) -> None:
+    def __init__(self, options: CalibrationOptions, layout: Layout, *, rolling: bool = False) -> None:
         super().__init__(
             options, "no features have been followed yet: is the picture dark or blurred?", WINDOWS
         )
@@ -83,7 +82,7 @@ class TargetFreeStatus(Evaluator):
         self._after_change(self.camera)
         if self._quiet[0]:
             cause, value = self._quiet
-            self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
+            self.announce(Event(EventKind.WENT_ON, self.camera, cause=cause, cause_value=value))
             self._quiet = Cause.NONE, None
 
     def lost(
@@ -140,7 +139,7 @@ class TargetFreeStatus(Evaluator):
 
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; all else is kept."""
-        self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
+        self.announce(Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s))
         self._clock_changed_s.append(self.elapsed_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
@@ -156,16 +155,6 @@ class TargetFreeStatus(Evaluator):
             return False
         before_s, last_s = self._clock_changed_s
         return self.elapsed_s - last_s < last_s - before_s
-
-    def _announce(
-        self,
-        kind: EventKind,
-        value: float | None = None,
-        *,
-        cause: Cause = Cause.NONE,
-        cause_value: float | None = None,
-    ) -> None:
-        self.announce(Event(kind, self.camera, value, cause=cause, cause_value=cause_value))
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:

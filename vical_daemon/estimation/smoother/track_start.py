@@ -5,6 +5,11 @@ landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes
 that the system is inhomogeneous; gravity's size is known and its direction is relinearised in each round.
 Squares are divided by the distances found in the round before, or near points would draw everything towards
 the camera. [Martinelli, "Closed-form solution of visual-inertial structure from motion", 2014]
+
+Turns about one axis only (a cart on a floor, a joint of an arm) show two of the mounting's three angles. The
+third shows in how the rig moves: the accelerometer feels the direction in which the images see it go. With
+mountings turned all the way round about the axis, the rays meet for one only (`mounting_about`). A lever arm
+along the axis does not show at all; it is held.
 """
 
 from __future__ import annotations
@@ -18,17 +23,22 @@ from vical_daemon.estimation.filter.unobservable_directions import HELD_M
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products
-from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
+from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion, still_axes
 from vical_daemon.estimation.measurements import FloatArray, Frames, ImuNoise
 from vical_daemon.estimation.model.inertial_links import make_links
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 ROUNDS = 8  # of reweighting by the depths found and by outliers
 _RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
+_STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
+_FINE_RAD = float(np.deg2rad(4.0))  # likewise about the best: the window converges from there
+_APART_RAD = float(np.deg2rad(45.0))  # from here on it is another mounting
+_CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
 
 class NoStartError(Exception):
@@ -96,10 +106,9 @@ class TrackStart:
         self.camera, self._gravity_mps2 = camera, gravity_mps2
         self._R = products(links.dR[None])[0]
         self._motion = LinearMotion.along(self._R, links.dt, links.dR, links.dv, links.dp)
-        none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         zero = np.zeros((len(frames), 3))
         window = Window(
-            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, none
+            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, Landmarks.none()
         )
         window.bias[:, :3], window.imu = imu[:3], imu[6:]
         window.fit_knots()
@@ -111,7 +120,7 @@ class TrackStart:
                 " more texture or slower motion is needed"
             )
         self._rays, self._ok = rays_of(self._seen.uv, camera)
-        window.landmarks = none
+        window.landmarks = Landmarks.none()
         self._window = window
 
     def misfit(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> float:
@@ -211,3 +220,57 @@ def _upright(down: FloatArray) -> FloatArray:
         return np.diag([1.0, -1.0, -1.0])
     hat = so3.hat(axis)
     return np.asarray(np.eye(3) + hat + hat @ hat / (1.0 + cosine))
+
+
+def still_axis(t_s: FloatArray, gyro_rps: FloatArray, bias_rps: FloatArray) -> FloatArray | None:
+    """Return the one axis of the imu that kept its direction, unit, shape (3,); None: none, or all did.
+
+    Args:
+        t_s: Instants, s, shape (m,).
+        gyro_rps: Rates, rad/s, shape (m, 3).
+        bias_rps: Of the gyro, rad/s, shape (3,).
+    """
+    curve = GyroCurve.integrate(t_s, gyro_rps, bias_rps)
+    axes = still_axes(curve.R_ref_imu.mean(axis=0))
+    return axes[0] if len(axes) == 1 else None
+
+
+def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, arm: ArmPrior) -> FloatArray:
+    """Find the mounting among those turned about an axis.
+
+    Args:
+        start: The stretch.
+        axis: Of the imu, unit, shape (3,).
+        R_imu_cam: Mounting, right but for a turn about that axis, shape (3, 3).
+        arm: What is known of the lever arm.
+
+    Returns:
+        The mounting, shape (3, 3), good to a degree or so.
+
+    Raises:
+        NoStartError: Others fit nearly as well.
+    """
+    angles = np.arange(-np.pi, np.pi - 1e-9, _STEP_RAD)
+
+    def misfit(angle: float, rounds: int = ROUNDS) -> float:
+        return start.misfit(so3.exp(angle * axis) @ R_imu_cam, arm, rounds)
+
+    found = np.array([misfit(a, ROUNDS // 2) for a in angles])
+    best = float(angles[np.argmin(found)])
+    away = np.abs((angles - best + np.pi) % (2.0 * np.pi) - np.pi) > _APART_RAD
+    if not found.min() * _CONTRAST < found[away].min():
+        raise NoStartError(
+            "the mounting about the one axis that the rig turns about does not show yet: speed up and brake,"
+            " or turn the rig about a second axis"
+        )
+    for step in (_STEP_RAD / 2.0, _FINE_RAD):
+        best += _vertex(step, *(misfit(best + x) ** 2 for x in (-step, 0.0, step)))
+    return np.asarray(so3.exp(best * axis) @ R_imu_cam)
+
+
+def _vertex(step: float, low: float, middle: float, high: float) -> float:
+    """Where a parabola through three points has its least value; at most a step away."""
+    bend = low - 2.0 * middle + high
+    if not np.isfinite(bend) or bend <= 0.0:
+        return 0.0 if middle <= min(low, high) else step * float(np.sign(low - high))
+    return step * float(np.clip(0.5 * (low - high) / bend, -1.0, 1.0))

@@ -18,11 +18,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, ImuNoise
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
-from vical_daemon.estimation.model.inertial_links import (
-    RELINK_S,
-    PreintegratedLinks,
-    make_links,
-)
+from vical_daemon.estimation.model.inertial_links import RELINK_S, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 
@@ -73,6 +69,11 @@ class Landmarks:
     anchor: FloatArray
     bearing: FloatArray
     inverse: FloatArray
+
+    @classmethod
+    def none(cls) -> Landmarks:
+        """No points."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 @dataclass(slots=True)
@@ -310,9 +311,8 @@ def place(
     anchor = c[first]
     P = (np.eye(3) - d[:, :, None] * d[:, None, :]) * ok[:, None, None]
     N = np.add.reduceat(P, first) + 1e-6 * np.eye(3)
-    X = np.linalg.solve(N, np.add.reduceat(np.matmul(P, (c - anchor[seen.landmark])[..., None]), first))[
-        ..., 0
-    ]
+    away = np.add.reduceat(np.matmul(P, (c - anchor[seen.landmark])[..., None]), first)
+    X = np.linalg.solve(N, away)[..., 0]
     # the middle observation gives the bearing of those whose rays hardly cross
     distance = np.linalg.norm(X, axis=1)
     along = (X * d[first]).sum(axis=1) / np.maximum(distance, 1e-9)

@@ -26,6 +26,11 @@ from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_S
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 
 _SPAN = 20  # estimates that are compared, one a second
+IMAGES = 10
+"""Images refused in a row after which the pose is found again, and images after an alarm that show what has
+changed."""
+_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
+_DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 
 @dataclass(slots=True)
@@ -60,24 +65,13 @@ class DriftWatch:
         """
         if not self.due(t_s):
             return False
-        far = max(
-            (
-                abs(value - old)
-                / np.sqrt(factor * max(old_variance + walk * (t_s - at_s) - variance, 0.0) + self.floor**2)
-                for at_s, old, old_variance in self._past
-            ),
-            default=0.0,
-        )
+        far = 0.0
+        for at_s, old, old_variance in self._past:
+            gained = factor * max(old_variance + walk * (t_s - at_s) - variance, 0.0)
+            far = max(far, abs(value - old) / np.sqrt(gained + self.floor**2))
         self._past.append((t_s, value, variance))
         self.doubtful = bool(far > PERHAPS_SIGMAS)
         return bool(far > SURE_SIGMAS)
-
-
-IMAGES = 10
-"""Images refused in a row after which the pose is found again, and images after an alarm that show what has
-changed."""
-_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
-_DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 
 class Action(Enum):
@@ -209,9 +203,8 @@ class ChangeWatch:
         if index is None:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR))
-        watch.floor = float(
-            np.hypot(_DRIFT_FLOOR, np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s)))
-        )
+        by_stamps = np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s))
+        watch.floor = float(np.hypot(_DRIFT_FLOOR, by_stamps))
         if not watch.due(t_s):
             return Action.NONE
         variance, walk = float(f.S[index] @ f.S[index]), float(f.walk[index])

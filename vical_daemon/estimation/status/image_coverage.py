@@ -17,7 +17,6 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
 
 _ACROSS, _DOWN = 16, 12  # parts of the picture
-_LAST, _NUMBER = np.array([_ACROSS - 1, _DOWN - 1]), np.array([1, _ACROSS])  # part, and its number: x, y
 _LEAST = 5  # corners of a part that has been seen
 _SHARE = 0.5  # of the parts along an edge
 _PARTLY = 0.75  # of the most corners in one image; fewer: targets are seen that are partly in the picture
@@ -61,9 +60,9 @@ class ImageCoverage:
 
     def add(self, uv_px: FloatArray) -> None:
         """Take the corners of one image, shape (n, 2)."""
-        part = np.maximum(np.minimum((uv_px / self._part_px).astype(np.int64), _LAST), 0)
-        places = np.bincount(part @ _NUMBER, minlength=self._counts.size)
-        self._counts += places.reshape(_DOWN, _ACROSS)
+        column, row = (uv_px / self._part_px).astype(np.intp).T
+        places = np.ravel_multi_index((row, column), self._counts.shape, mode="clip")
+        self._counts += np.bincount(places, minlength=self._counts.size).reshape(self._counts.shape)
         self._most, self._least = max(self._most, len(uv_px)), min(self._least, len(uv_px))
 
     def unseen_edges(self) -> tuple[Edge, ...]:
@@ -71,10 +70,6 @@ class ImageCoverage:
         if self._least >= _PARTLY * self._most:
             return ()
         seen = self._counts >= _LEAST
-        edges: dict[Edge, BoolArray] = {
-            "left": seen[:, 0],
-            "right": seen[:, -1],
-            "top": seen[0],
-            "bottom": seen[-1],
-        }
+        edges: dict[Edge, BoolArray]
+        edges = {"left": seen[:, 0], "right": seen[:, -1], "top": seen[0], "bottom": seen[-1]}
         return tuple(name for name, parts in edges.items() if parts.mean() < _SHARE)

@@ -70,9 +70,8 @@ def _differs(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64
         return False
     values, axes = np.linalg.eigh(covariance)  # one of a fixed mounting is zero
     along = (axes.T @ vector) ** 2
-    return bool(
-        np.sum(along / np.maximum(values, 1e-12 * irrelevant**2)) > chi_square_limit(3, LIKELY_SIGMAS)
-    )
+    square = np.sum(along / np.maximum(values, 1e-12 * irrelevant**2))
+    return bool(square > chi_square_limit(3, LIKELY_SIGMAS))
 
 
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:

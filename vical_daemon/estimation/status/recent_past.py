@@ -29,9 +29,8 @@ from vical_daemon.estimation.temporal.shift_step import (
 )
 
 BEFORE_S = 3.0  # a change is noticed within
-_STRETCHES = (10, 15, 30)  # images in which a step is looked for
+_STRETCHES = (10, 15, 30)  # images in which a step is looked for; the most show how well they usually fit
 _LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
-_BEFORE_IMAGES = 30  # that show how well orientations usually fit
 _MOST = 200  # images kept, a camera
 
 _Poses = dict[float, TargetPose | None]
@@ -170,7 +169,7 @@ class RecentPast:
         curve, known = _curve(buffer, f), f.state.cameras[frames[0][1].camera]
         used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
         sound_s = min(frames[0][0], f.state.t_s - known.timeshift_s)
-        before = _orientations([x for x in used if x[0] < sound_s][-_BEFORE_IMAGES:], f, target, poses)
+        before = _orientations([x for x in used if x[0] < sound_s][-_STRETCHES[-1] :], f, target, poses)
         level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
 

@@ -18,7 +18,13 @@ from vical_daemon.estimation.model.priors import OFF, SURE
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 from vical_daemon.estimation.significance import EVERY_S
-from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
+from vical_daemon.estimation.status.evaluator import (
+    Evaluator,
+    Verdict,
+    lacking_verdict,
+    lens_known,
+    lens_verdict,
+)
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import HELD_BACK_EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
@@ -29,7 +35,6 @@ from vical_daemon.estimation.status.mounting_changes import (
     lens_difference,
     visible_move_m,
 )
-from vical_daemon.estimation.status.steady_status import Verdict
 from vical_daemon.estimation.wording import not_in_view
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
@@ -148,9 +153,7 @@ class StatusEvaluator(Evaluator):
 
     # ------------------------------------------------------------------ output
     def estimate(
-        self,
-        f: CalibrationFilter | None,
-        stale: CalibrationFilter | None = None,
+        self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
         """Put everything together; `stale`: what was known before a change, shown while restarting."""
         shares = None if f is None else model_selection.weights(f)

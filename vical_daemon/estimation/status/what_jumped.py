@@ -104,9 +104,8 @@ def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
         out[Part.MOUNTING] = _columns(layout.size, mountings[camera], sigmas)
     if where.intrinsics is not None:  # of a fixed lens, too: its errors are considered
         focal = float(state.cameras[camera].intrinsics[0])
-        out[Part.LENS] = _columns(
-            layout.size, every[where.intrinsics], focal * np.repeat([_ZOOM, _SHIFTED], 2)
-        )
+        sizes = focal * np.repeat([_ZOOM, _SHIFTED], 2)
+        out[Part.LENS] = _columns(layout.size, every[where.intrinsics], sizes)
     if len(mountings) > 1:
         errors = [k for own in mountings.values() for k in own]
         out[Part.MOUNTINGS] = _columns(layout.size, errors, np.tile(sigmas, len(mountings)))

@@ -12,6 +12,7 @@ from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, PlanarPose,
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
 
+_CORNER_PX = 0.5  # noise of a corner per axis: scales the covariances only
 _MAX_RMS_PX = 8.0  # a pose that misses its corners by more is a wrong detection
 
 
@@ -38,7 +39,6 @@ def target_orientations(
     intrinsics: FloatArray,
     distortion: FloatArray,
     model: str = "radtan",
-    corner_sigma_px: float = 0.5,
 ) -> Orientations:
     """Turn views of a planar target into camera orientations.
 
@@ -53,12 +53,11 @@ def target_orientations(
         intrinsics: fx fy cx cy, px, shape (4,).
         distortion: Four coefficients, shape (4,).
         model: radtan or equidistant.
-        corner_sigma_px: Noise of a corner per axis, px (scales the covariances only).
 
     Returns:
         The orientations with their covariances.
     """
-    sigma = corner_sigma_px / float(np.mean(intrinsics[:2]))
+    sigma = _CORNER_PX / float(np.mean(intrinsics[:2]))
     stamps: list[int] = []
     poses: list[PlanarPose] = []
     frames = list(frames)

@@ -13,7 +13,9 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
 from vical_daemon.estimation.significance import SURE_SIGMAS
-from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 
 _DRIFT_WALK = 1e-6
 """How much the drift rate may change, 1/sqrt(s): a drift of 20 ppm that begins is followed within sigma; with

@@ -60,17 +60,12 @@ class DriftSolution:
         covariance: Of the parameters, then the gyro bias in the middle, shape (p + 3, p + 3).
         states: s_k, shape (n, d).
         noise: e_k - H_k s_k - J_k x: what is left to the measurements, rad, shape (n, 3).
-        quadratic: Weighted sum of squares at the minimum, measurements, states and priors.
-        log_determinant: log det of the information of all unknowns, less that of the state's steps: with
-            `quadratic` and the weights' own this is -2 log of the restricted likelihood.
     """
 
     x: FloatArray
     covariance: FloatArray
     states: FloatArray
     noise: FloatArray
-    quadratic: float
-    log_determinant: float
 
 
 def _band(problem: DriftProblem) -> FloatArray:
@@ -103,8 +98,9 @@ class _Reduced:
         Y: L^-1 [H' W J, H' W e + prior, unit vectors of the bias in the middle], shape (n d, p + 1 or p + 4).
         P: Covariance of the parameters, shape (p, p).
         x: Parameters, shape (p,).
-        quadratic: As in `DriftSolution`.
-        log_determinant: As in `DriftSolution`.
+        quadratic: Weighted sum of squares at the minimum, measurements, states and priors.
+        log_determinant: log det of the information of all unknowns, less that of the state's steps: with
+            `quadratic` and the weights' own this is -2 log of the restricted likelihood.
     """
 
     factor: FloatArray
@@ -169,7 +165,7 @@ def solve(problem: DriftProblem) -> DriftSolution:
     covariance[:p, p:] = covariance[p:, :p].T
     covariance[p:, p:] = gain[:, p + 1 :] + gain[:, :p] @ P @ gain[:, :p].T
     noise = problem.e - (problem.H @ states[..., None])[..., 0] - problem.J @ x
-    return DriftSolution(x, covariance, states, noise, reduced.quadratic, reduced.log_determinant)
+    return DriftSolution(x, covariance, states, noise)
 
 
 def _inverse(S: FloatArray) -> tuple[FloatArray, float]:

@@ -117,8 +117,7 @@ def persistent_scores(
         cross = np.einsum("sik,sjk->ij", mine, carried[track[a:b]])
         together += cross + cross.T
         carried[track[a:b]] += mine
-    out: FloatArray = noise.white * white + noise.persistent * together
-    return out
+    return np.asarray(noise.white * white + noise.persistent * together)
 
 
 def sighting_errors(
@@ -176,5 +175,4 @@ def gyro_scores(
     np.add.at(steps, pairs.first, each)
     np.add.at(steps, pairs.second, -each)
     open_pairs = np.cumsum(steps, axis=0)[:-1]  # all pairs that an interval between images lies in
-    out: FloatArray = density**2 * np.einsum("t,tik,tjk->ij", np.diff(t_cam_s), open_pairs, open_pairs)
-    return out
+    return np.asarray(density**2 * np.einsum("t,tik,tjk->ij", np.diff(t_cam_s), open_pairs, open_pairs))

@@ -114,8 +114,7 @@ def epipolar_fit(
     pairs = make_pairs(frames, every=every)
     if pairs is None:
         return None
-    fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens)
-    fit.gyro_density, fit.frames = gyro_density, frames
+    fit = _Fit(t_imu_s, gyro_rps, frames, pairs, lens, fit_lens, gyro_density)
     return fit.run(R_imu_cam.copy(), timeshift_s)
 
 
@@ -131,17 +130,17 @@ class _Fit:
         self,
         t_imu: FloatArray,
         gyro: FloatArray,
-        t_cam: FloatArray,
+        frames: Frames,
         pairs: Pairs,
         lens: tuple[FloatArray, FloatArray, str],
         fit_lens: bool,
+        gyro_density: float | None,
     ) -> None:
-        self.t_imu, self.gyro, self.t_cam = t_imu, gyro, t_cam
+        self.t_imu, self.gyro, self.gyro_density = t_imu, gyro, gyro_density
+        self.frames, self.t_cam = frames, np.array([t for t, _ in frames])
         self.pairs, self.fit_lens, self.lens_free = pairs, fit_lens, False
         self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
         self.given = (lens[0].copy(), lens[1].copy())
-        self.gyro_density: float | None = None
-        self.frames: Frames = []
         self.dray: list[FloatArray] = []
         self.shrinking = np.zeros((len(pairs.of), 2))
         self.lasting = 1.0
@@ -386,7 +385,8 @@ class _Fit:
         for chosen in [np.ones(len(t), dtype=np.bool_), *(stretch == k for k in range(count))]:
             w = good * chosen[p.of] / max(error, 1e-9) ** 2
             H, g, _ = self._normal(weight * e, J, Jt, w)
-            clear = self._without_direction(J, Jt, w) * w[:, None]
+            follows = self._directions(J, Jt, w)[1]
+            clear = (J - np.vecmat(Jt, follows[p.of])) * w[:, None]  # each pair's direction follows along
             M = persistent_scores(clear, p, self.t_cam, self.effects, noise)
             M += slope**2 * gyro_scores(clear, p, self.t_cam, self.effects, self.gyro_density)
             inverse = np.linalg.inv(slope * H + prior)
@@ -395,13 +395,7 @@ class _Fit:
         return out[1:], out[0][1], slope
 
     def _bent_by_noise(
-        self,
-        R: FloatArray,
-        shift: float,
-        bias: FloatArray,
-        weight: FloatArray,
-        slope: float,
-        error: float,
+        self, R: FloatArray, shift: float, bias: FloatArray, weight: FloatArray, slope: float, error: float
     ) -> FloatArray:
         """What the errors of the sightings do to mounting and delay on average, shape (4,).
 
@@ -413,9 +407,7 @@ class _Fit:
         given = self.pairs
         first, second = sighting_errors(given, self.t_cam, self.noise, float(np.mean(self.intrinsics[:2])))
         good = weight > _GOOD
-        moved: list[FloatArray] = []
-        squares: list[float] = []
-        H: FloatArray = np.zeros((0, 0))
+        moved, squares, H = list[FloatArray](), list[float](), np.zeros((0, 0))
         for sign in (0.0, 1.0, -1.0):
             self.pairs = given.moved(sign * first, sign * second)
             self._rays()
@@ -462,11 +454,6 @@ class _Fit:
             self._rays()
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return track_noise(columns[0], columns[1], columns[2], columns[3])
-
-    def _without_direction(self, J: FloatArray, Jt: FloatArray, weight: FloatArray) -> FloatArray:
-        """Derivatives by the shared unknowns with each pair's direction following along, shape (n, p)."""
-        moved = self._directions(J, Jt, weight)[1]
-        return np.asarray(J - np.vecmat(Jt, moved[self.pairs.of]))
 
 
 def _products(a: FloatArray, b: FloatArray, begin: IntArray) -> FloatArray:

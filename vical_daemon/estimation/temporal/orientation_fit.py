@@ -19,16 +19,10 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftProblem, DriftSolution, solve
 from vical_daemon.estimation.temporal.drift_smoother import cost as drift_cost
-from vical_daemon.estimation.temporal.orientation_problem import (
-    Linear,
-    OrientationSensor,
-    linearise,
-)
+from vical_daemon.estimation.temporal.orientation_problem import Linear, OrientationSensor, linearise
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
-
-__all__ = ["Fit", "OrientationSensor", "polish"]
 
 _GATE = chi_square_limit(3, PERHAPS_SIGMAS)  # of an orientation
 _ROUNDS = 12  # Gauss-Newton steps, at most; each finds again which orientations count
@@ -175,7 +169,8 @@ def polish(
     S, scales = len(sensors), scales_of(sensors, log_gyro)
     widened = widening(scaled(linear, scales), linear.used, S)
     factor = np.concatenate([np.repeat(widened, (3, 1), axis=1).ravel(), np.ones(3)])
-    covariance = _wanted(solution.covariance, S) * np.outer(factor, factor)
+    wanted = [*range(4 * S), -3, -2, -1]  # without the gyro's matrix: mountings and shifts, then the bias
+    covariance = solution.covariance[np.ix_(wanted, wanted)] * np.outer(factor, factor)
     return Fit(sensors, covariance, bias, rounds, *_stamp_rates(linear, S, scales), widened)
 
 
@@ -193,11 +188,7 @@ def _stamp_rates(linear: Linear, S: int, scales: FloatArray) -> tuple[FloatArray
 
 
 def _update(
-    linear: Linear,
-    sensors: tuple[OrientationSensor, ...],
-    solution: DriftSolution,
-    *,
-    rescale: bool,
+    linear: Linear, sensors: tuple[OrientationSensor, ...], solution: DriftSolution, *, rescale: bool
 ) -> tuple[tuple[OrientationSensor, ...], float]:
     """Apply a step, and gate every orientation again by its residual over its noise."""
     noise = np.empty_like(solution.noise)
@@ -229,10 +220,3 @@ def _update(
             )
         )
     return tuple(updated), largest
-
-
-def _wanted(covariance: FloatArray, S: int) -> FloatArray:
-    """Leave out the gyro's matrix: mountings and shifts, then the bias."""
-    p = len(covariance) - 3
-    keep = [*range(4 * S), *range(p, p + 3)]
-    return covariance[np.ix_(keep, keep)]

@@ -32,8 +32,7 @@ def running_integral(dt_s: FloatArray, values: FloatArray) -> FloatArray:
 def _turn(rate: FloatArray, slope: FloatArray, s: FloatArray) -> FloatArray:
     """Rotation vector of a rate that changes linearly over s seconds, with the coning term (third order)."""
     s = s[..., None]
-    out: FloatArray = s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * so3.cross(rate, slope)
-    return out
+    return np.asarray(s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * so3.cross(rate, slope))
 
 
 @dataclass(frozen=True)
@@ -113,8 +112,7 @@ class GyroCurve:
         total = running_integral(np.diff(self.t_s), flow)
         k, s, _ = self._segment(times_s)
         share = (s / (self.t_s[k + 1] - self.t_s[k]))[..., None]
-        out: FloatArray = total[k] + share * (total[k + 1] - total[k])
-        return out.reshape(*times_s.shape, 3, 9)
+        return np.reshape(total[k] + share * (total[k + 1] - total[k]), (*times_s.shape, 3, 9))
 
     def variance(self, times_s: FloatArray, density: float) -> FloatArray:
         """Return the variance per axis gathered since the start: white gyro noise is a random walk in angle.
@@ -123,8 +121,8 @@ class GyroCurve:
             times_s: Instants, s.
             density: Gyro noise density, rad/s/sqrt(Hz).
         """
-        walk: FloatArray = density**2 * (times_s - self.t_s[0])
-        return walk + np.interp(times_s, self.t_s, self.hole_variance)
+        by_holes = np.interp(times_s, self.t_s, self.hole_variance)
+        return np.asarray(density**2 * (times_s - self.t_s[0]) + by_holes)
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,7 @@ class OrientationCurve:
     def interpolate(cls, t_s: FloatArray, q_ref_body: FloatArray) -> OrientationCurve:
         """Prepare the interpolation of a stream of orientations (w x y z)."""
         dt = np.diff(t_s)
-        turn = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(q_ref_body[:-1]), q_ref_body[1:]))
+        turn = so3.turn_between(q_ref_body[:-1], q_ref_body[1:])
         mean = turn / dt[:, None]
         rate = np.empty((len(t_s), 3))
         # three-point derivative: the neighbour intervals' mean rates, the nearer one weighs more
@@ -164,9 +162,7 @@ class OrientationCurve:
         h = self.t_s[k + 1] - self.t_s[k]
         u = ((times_s - self.t_s[k]) / h)[..., None]
         h = h[..., None]
-        whole = so3.rotvec_from_quat(
-            so3.quat_multiply(so3.quat_conjugate(self.q_ref_body[k]), self.q_ref_body[k + 1])
-        )
+        whole = so3.turn_between(self.q_ref_body[k], self.q_ref_body[k + 1])
         v0 = self.rate_rps[k] * h
         v1 = np.einsum("...ij,...j->...i", so3.right_jacobian_inverse(whole), self.rate_rps[k + 1]) * h
         a, b = 3.0 * whole - 2.0 * v0 - v1, v0 + v1 - 2.0 * whole
@@ -190,8 +186,7 @@ class OrientationCurve:
 
     def variance(self, times_s: FloatArray, density: float) -> FloatArray:
         """Return a small drift: measured orientations do not walk; their noise is the caller's to add."""
-        out: FloatArray = (0.02 * density) ** 2 * (times_s - self.t_s[0])
-        return out
+        return np.asarray((0.02 * density) ** 2 * (times_s - self.t_s[0]))
 
 
 RotationCurve = GyroCurve | OrientationCurve

@@ -69,7 +69,7 @@ def closest_points(
     rate = np.zeros((len(tau), 3))
     for _ in range(2):
         R, rate, _ = curve.at(tau)
-        r = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(so3.quat_from_matrix(R)), q_target))
+        r = so3.turn_between(so3.quat_from_matrix(R), q_target)
         step = np.vecdot(rate, r) / (np.vecdot(rate, rate) + 1e-6)
         tau = np.clip(tau + np.clip(step, -window_s / 6, window_s / 6), low, high)
     return np.clip(tau, times_s - window_s, times_s + window_s), rate

@@ -9,18 +9,17 @@ The model (t_imu = t_cam + shift): `R_world_cam(t) = R_world_ref R_ref_imu(t + s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import geman_mcclure_weight
-from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
-_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s
-_FINE_S = 0.0025  # likewise about the best ones
+_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s; a quarter of it about the best ones
 _CANDIDATES = 4  # shifts whose directions are compared too: periodic motion agrees in size at several
 
 
@@ -58,16 +57,13 @@ class Start:
 
 def angles_between(qa: FloatArray, qb: FloatArray) -> FloatArray:
     """Angles between orientations given as quaternions (..., 4), rad, shape (...,)."""
-    dot = np.abs(np.vecdot(qa, qb))
-    out: FloatArray = 2.0 * np.arccos(np.minimum(dot, 1.0))
-    return out
+    return np.asarray(2.0 * np.arccos(np.minimum(np.abs(np.vecdot(qa, qb)), 1.0)))
 
 
 def robust_cost(difference: FloatArray, scale: float) -> FloatArray:
     """Geman-McClure: 0 for agreement, towards 1 for gross disagreement."""
     d2 = (difference / scale) ** 2
-    out: FloatArray = d2 / (1.0 + d2)
-    return out
+    return np.asarray(d2 / (1.0 + d2))
 
 
 def shift_costs(
@@ -86,9 +82,7 @@ def shift_costs(
     ia, ib = a + offsets[:, None], b + offsets[:, None]
     inside = (ia >= 0) & (ib < len(grid))
     angle = angles_between(grid[np.where(inside, ia, 0)], grid[np.where(inside, ib, 0)])
-    cost = np.where(inside, robust_cost(angle - turns.angle, scale), 0.6)
-    out: FloatArray = cost.mean(axis=1)
-    return out
+    return np.asarray(np.where(inside, robust_cost(angle - turns.angle, scale), 0.6).mean(axis=1))
 
 
 def agreement_scale(turns: Turns) -> float:
@@ -144,7 +138,7 @@ def _start_at(
     curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float
 ) -> Start | None:
     """Refine the shift around a grid point and solve for the mounting there."""
-    fine = shift_s + np.arange(-6, 7) * _FINE_S
+    fine = shift_s + np.arange(-6, 7) * (_GRID_S / 4.0)
     low, high = curve.span_s
     ta, tb = t_cam_s[turns.first] + fine[:, None], t_cam_s[turns.second] + fine[:, None]
     inside = (ta >= low) & (tb <= high)
@@ -158,40 +152,30 @@ def _start_at(
     if np.count_nonzero(use) < 6:
         return None
     qa, qb = curve.quaternion(ta[best][use]), curve.quaternion(tb[best][use])
-    turn_imu = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(qa), qb))
+    turn_imu = so3.turn_between(qa, qb)
     dt = tb[best][use] - ta[best][use]
-    fit = _mounting(turn_imu, turns.rotvec_cam[use], dt)
+    R, bias, misfit, mirrored = _mounting(turn_imu, turns.rotvec_cam[use], dt)
     agreement = float(np.mean(np.abs(difference[best][inside[best]]) < scale))
     # turns whose size does not agree count as badly as a whole turn misplaced
     share = np.count_nonzero(use) / len(turns.first)
     return Start(
         shift,
-        fit.R,
-        fit.bias,
+        R,
+        bias,
         agreement,
-        fit.misfit / share**2,
-        fit.mirrored,
+        misfit / share**2,
+        mirrored,
         float(np.median(turns.angle)),
         turns.baseline_s,
         scale,
     )
 
 
-@dataclass(frozen=True)
-class _Mounting:
-    R: FloatArray
-    bias: FloatArray
-    misfit: float
-    mirrored: bool
-
-
-def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mounting:
-    """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; watches for mirrored axes."""
-    weight = np.ones(len(dt))
-    bias = np.zeros(3)
-    R = np.eye(3)
-    residual = turn_imu
-    mirrored = False
+def _mounting(
+    turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray
+) -> tuple[FloatArray, FloatArray, float, bool]:
+    """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; the misfit; mirrored axes?"""
+    weight, bias = np.ones(len(dt)), np.zeros(3)
     for i in range(8):
         target = turn_imu - bias * dt[:, None]
         U, s, Vt = np.linalg.svd((target * weight[:, None]).T @ turn_cam)
@@ -206,5 +190,81 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
         residual = residual - bias * dt[:, None]
         length2 = np.vecdot(residual, residual)
         weight = geman_mcclure_weight(length2 / max(2.0 * float(np.median(length2)), 1e-12))
-    misfit = float(np.sqrt(np.median(np.vecdot(residual, residual))))
-    return _Mounting(R, bias, misfit, mirrored)
+    return R, bias, float(np.sqrt(np.median(length2))), mirrored
+
+
+@dataclass(frozen=True)
+class GyroReference:
+    """A gyro.
+
+    Attributes:
+        t_s: Stamps, increasing, s, shape (m,).
+        gyro_rps: Rates in the imu frame, rad/s, shape (m, 3).
+        sensor, name: What the other sensor and the reference are called in messages.
+    """
+
+    t_s: FloatArray
+    gyro_rps: FloatArray
+    sensor: str = "camera"
+    name: str = "IMU"
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last sample, s."""
+        return float(self.t_s[0]), float(self.t_s[-1])
+
+    def curve(self, bias_rps: FloatArray) -> RotationCurve:
+        """The orientation over time, for a gyro bias (3,)."""
+        return GyroCurve.integrate(self.t_s, self.gyro_rps, bias_rps)
+
+    def start(
+        self, t_s: FloatArray, q_world_sensor: FloatArray, shifts_s: tuple[float, float]
+    ) -> tuple[Start | None, FloatArray]:
+        """Find a start for orientations (n, 4) at `t_s` (n,), and the bias to begin with, rad/s (3,).
+
+        It is found once more with the bias that it reveals if that bias blurs the agreement.
+        """
+        bias = np.zeros(3)
+        start: Start | None = None
+        for _ in range(3):
+            start = coarse_start(self.curve(bias), t_s, q_world_sensor, shifts_s)
+            if start is None:
+                break
+            bias = bias + start.bias_rps
+            if np.linalg.norm(start.bias_rps) * start.baseline_s < 0.25 * start.scale_rad:
+                break
+        return start, bias
+
+    def mirrored(self) -> GyroReference:
+        """Every mirrored mounting is this and a rotation."""
+        return replace(self, gyro_rps=self.gyro_rps * np.array([-1.0, 1.0, 1.0]))
+
+
+@dataclass(frozen=True)
+class StreamReference:
+    """Orientations, interpolated; they have no bias. Attributes and methods as those of a gyro."""
+
+    orientations: OrientationCurve
+    sensor: str = "sensor"
+    name: str = "reference"
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last orientation, s."""
+        return self.orientations.span_s
+
+    def curve(self, _bias_rps: FloatArray) -> RotationCurve:
+        """The orientations."""
+        return self.orientations
+
+    def start(
+        self, t_s: FloatArray, q_world_sensor: FloatArray, shifts_s: tuple[float, float]
+    ) -> tuple[Start | None, FloatArray]:
+        """Find a start."""
+        return coarse_start(self.orientations, t_s, q_world_sensor, shifts_s), np.zeros(3)
+
+    def mirrored(self) -> None:
+        """Orientations are rotations: no axis can be reversed."""
+
+
+Reference = GyroReference | StreamReference

@@ -20,7 +20,7 @@ from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 IntArray = npt.NDArray[np.intp]
 
 MIN_RATE_RPS = np.deg2rad(3.0)  # slower than this is "not moving"
-MIN_PAIRS = 8  # 24 equations for mounting, bias and delay
+MIN_PAIRS = 8  # 24 equations for mounting, bias and delay; as many orientations for a world and a delay
 # Turns are taken over the shortest of these times over which they are distinct, s: a short one is little
 # touched by outliers, by the gyro's bias and by holes; each doubling doubles the turn over the same noise.
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)
@@ -79,9 +79,7 @@ def turns_apart(t_cam_s: FloatArray, q_world_cam: FloatArray, baseline_s: float 
     dt = t_cam_s[second] - t_cam_s[first]
     keep = dt < max(3.0 * baseline_s, 1.5 * float(np.median(dt)) if len(dt) else 0.0)
     first, second = first[keep], second[keep]
-    turn = so3.rotvec_from_quat(
-        so3.quat_multiply(so3.quat_conjugate(q_world_cam[first]), q_world_cam[second])
-    )
+    turn = so3.turn_between(q_world_cam[first], q_world_cam[second])
     return Turns(first, second, turn, np.linalg.norm(turn, axis=1), baseline_s=baseline_s)
 
 
@@ -138,8 +136,7 @@ def orientation_noise(t_s: FloatArray, q: FloatArray) -> float:
     usual = float(np.median(dt))
     if usual > _SLOWEST_S:
         return 0.0
-    turn = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(q[:-1]), q[1:]))
-    turn = turn * (usual / dt)[:, None]
+    turn = so3.turn_between(q[:-1], q[1:]) * (usual / dt)[:, None]
     even = np.abs(dt - usual) < 0.5 * usual
     even = even[2:] & even[1:-1] & even[:-2]
     third = np.linalg.norm(turn[2:] - 2.0 * turn[1:-1] + turn[:-2], axis=1)[even]

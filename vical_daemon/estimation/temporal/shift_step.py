@@ -14,9 +14,9 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS
 
 _GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
-_LEAST_IMAGES = 8  # 24 equations for a world's orientation and the shift
 _STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
 _APART_S = 0.05  # other places on the curve begin so far from the best
 
@@ -53,7 +53,7 @@ def level_at(curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, ti
     """Sum of squares over its degrees of freedom, of orientations that fit: at least 1; 1 if not covered."""
     t_s = seen.t_cam_s + timeshift_s
     inside = (t_s > curve.span_s[0]) & (t_s < curve.span_s[1])
-    if inside.sum() < _LEAST_IMAGES:
+    if inside.sum() < MIN_PAIRS:
         return 1.0
     e = _errors(curve, Orientations(*(x[inside] for x in seen)), R_imu_cam, np.array([timeshift_s]))
     return max(float((e**2).sum()) / (e.size - 3), 1.0)
@@ -81,7 +81,7 @@ def find_shift(
         The fit; None where none fits, more than one does, or the curve does not reach.
     """
     t_cam_s = seen.t_cam_s
-    if len(t_cam_s) < _LEAST_IMAGES:
+    if len(t_cam_s) < MIN_PAIRS:
         return None
     low_s = max(present_s - most_s, curve.span_s[0] - float(t_cam_s[0]))
     high_s = min(present_s + most_s, curve.span_s[1] - float(t_cam_s[-1]))
@@ -128,7 +128,7 @@ def first_after_step(
     """
     t_cam_s = seen.t_cam_s
     covered = t_cam_s + max(shifts_s) < curve.span_s[1]
-    if covered.sum() < _LEAST_IMAGES or t_cam_s[0] + min(shifts_s) < curve.span_s[0]:
+    if covered.sum() < MIN_PAIRS or t_cam_s[0] + min(shifts_s) < curve.span_s[0]:
         return None
     seen = Orientations(*(x[covered] for x in seen))
     t_cam_s = seen.t_cam_s

@@ -18,11 +18,11 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
+from vical_daemon.estimation.temporal.orientation_fit import Fit, polish
+from vical_daemon.estimation.temporal.orientation_problem import OrientationSensor
 from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve
-from vical_daemon.estimation.temporal.rotation_reference import GyroReference, Reference, StreamReference
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
-from vical_daemon.estimation.temporal.rotation_suspects import explain
+from vical_daemon.estimation.temporal.rotation_start import GyroReference, Reference, StreamReference
 from vical_daemon.estimation.temporal.td_icp_input import (
     USUAL_RAD,
     CleanStream,
@@ -31,7 +31,7 @@ from vical_daemon.estimation.temporal.td_icp_input import (
     clean_gyro,
     clean_stream,
 )
-from vical_daemon.estimation.temporal.td_icp_refusals import judge, refuse_motion, refuse_start
+from vical_daemon.estimation.temporal.td_icp_refusals import explain, judge, refuse_motion, refuse_start
 from vical_daemon.estimation.temporal.td_icp_result import (
     DEGENERATE,
     OK,
@@ -40,19 +40,6 @@ from vical_daemon.estimation.temporal.td_icp_result import (
     TdIcpResult,
     pair_delays,
 )
-
-__all__ = [
-    "DEGENERATE",
-    "OK",
-    "REFUSED",
-    "JointResult",
-    "OrientationStream",
-    "TdIcpOptions",
-    "TdIcpResult",
-    "joint_of_orientations",
-    "joint_with_gyro",
-    "td_icp",
-]
 
 ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
 _DOUBTFUL_RAD = float(np.deg2rad(0.5))

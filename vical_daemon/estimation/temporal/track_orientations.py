@@ -21,8 +21,7 @@ from vical_daemon.estimation.robust import MEDIAN_ABSOLUTE, geman_mcclure_weight
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
-_STEPS = 12  # Gauss-Newton steps of one pair of images
-_PLAIN_STEPS = 6  # before outliers are put aside
+_STEPS = 12  # Gauss-Newton steps of one pair of images; outliers are put aside in the second half
 _AT_ONCE = 32  # pairs in one batch of arrays: beyond, they leave the cache
 
 Pair = tuple[FloatArray, FloatArray]
@@ -122,7 +121,7 @@ def _adjusted(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] | None]:
     for i in range(_STEPS):
         e, J, basis = _linearise(R, t, rays_1, rays_2)
         cost = _middle(np.where(there, np.abs(e), np.inf), count)
-        if i >= _PLAIN_STEPS:
+        if i >= _STEPS // 2:
             scale = 3.0 * cost[:, None] / MEDIAN_ABSOLUTE + 1e-9
             weight = there * geman_mcclure_weight((e / scale) ** 2)
         Jt = np.swapaxes(J * weight[..., None], 1, 2)

@@ -24,17 +24,12 @@ Lens = tuple[FloatArray, FloatArray, str]
 
 _WINDOW_S = 20.0  # of a fit: a gyro's bias is constant over it
 _MOST_WINDOWS = 6  # two minutes in all, spread over a longer recording
-_MOST_STARTS = 3  # windows in which a start is looked for
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
 _INLIERS = 0.5  # share of the feature pairs that must fit
 
 
 def track_registration(
-    t_imu_s: FloatArray,
-    gyro_rps: FloatArray,
-    frames: Frames,
-    lens: Lens,
-    options: TdIcpOptions | None = None,
+    t_imu_s: FloatArray, gyro_rps: FloatArray, frames: Frames, lens: Lens, options: TdIcpOptions | None = None
 ) -> TdIcpResult:
     """Find delay, mounting and gyro bias from a gyro and tracks.
 
@@ -107,7 +102,7 @@ def _start(
 ) -> TdIcpResult:
     """Register strung-together rotations of one window; the next one where that does not work."""
     result = TdIcpResult(REFUSED, "too few features carry over from image to image")
-    for window in windows[:_MOST_STARTS]:
+    for window in windows:
         chains = track_orientations((frame for _, frame in window), *lens)
         if not chains:
             continue

@@ -98,20 +98,19 @@ def _design(tau_s: FloatArray) -> FloatArray:
     return np.stack([3.0 / tau_s**2, 1.0 / tau_s, np.full_like(tau_s, FLICKER), tau_s / 3.0], axis=-1)
 
 
-def averaging_factors(samples: int, per_octave: int = 4) -> IntArray:
-    """Return log-spaced averaging factors m from 1 to samples / 5, ascending, unique.
+def averaging_factors(samples: int) -> IntArray:
+    """Return averaging factors m from 1 to samples / 5, four an octave, ascending, unique.
 
     Raises:
         TooShortError: Fewer than 100 samples.
     """
     if samples < 100:
         raise TooShortError(f"an Allan analysis needs at least 100 samples at rest, got {samples}")
-    octaves = np.log2(samples / CLUSTERS_MIN)
-    powers = np.arange(0, int(octaves * per_octave) + 1) / per_octave
+    powers = np.arange(int(4.0 * np.log2(samples / CLUSTERS_MIN)) + 1) / 4.0
     return np.unique(np.round(2.0**powers)).astype(np.int64)
 
 
-def allan_curve(signal: FloatArray, rate_hz: float, per_octave: int = 4) -> AllanCurve:
+def allan_curve(signal: FloatArray, rate_hz: float) -> AllanCurve:
     """Return the overlapping Allan deviation of one axis over log-spaced averaging times.
 
     The degrees of freedom are those of the noise that dominates at each averaging time.
@@ -120,7 +119,7 @@ def allan_curve(signal: FloatArray, rate_hz: float, per_octave: int = 4) -> Alla
         TooShortError: Fewer than 100 samples.
     """
     samples = len(signal)
-    factors = averaging_factors(samples, per_octave)
+    factors = averaging_factors(samples)
     adev = allan_deviation(signal, rate_hz, factors)
     tau_s = factors / rate_hz
     edf = degrees_of_freedom(factors, np.zeros(len(factors), dtype=np.int64), samples)

@@ -111,16 +111,10 @@ def sigma_if_known(
         return 0.0
     S = covariance[np.ix_(b, b)]
     if k:
-        cross = covariance[np.ix_(b, k)]
         # scaled to correlations: pixels and distortion coefficients differ by orders of magnitude
         unit = np.sqrt(np.diag(covariance)[k])
-        S = (
-            S
-            - cross
-            / unit
-            @ np.linalg.pinv(covariance[np.ix_(k, k)] / np.outer(unit, unit))
-            @ (cross / unit).T
-        )
+        cross = covariance[np.ix_(b, k)] / unit
+        S = S - cross @ np.linalg.pinv(covariance[np.ix_(k, k)] / np.outer(unit, unit)) @ cross.T
     return float(np.sqrt(max(float(np.linalg.eigvalsh(S)[-1]), 0.0)))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.temporal.td_icp import OrientationStream
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream
 from vical_daemon.logs.trajectory import read_trajectory
 from vical_daemon.offline.errors import InputError, Warn, ignore
 from vical_daemon.offline.td_icp.sources import seconds

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior
-from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 from vical_daemon.logs import Recording, open_recording
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 

@@ -7,13 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.td_icp import (
-    JointResult,
-    OrientationStream,
-    joint_of_orientations,
-    joint_with_gyro,
-)
-from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
+from vical_daemon.estimation.temporal.td_icp import joint_of_orientations, joint_with_gyro
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream, clean_gyro
+from vical_daemon.estimation.temporal.td_icp_result import JointResult
 from vical_daemon.logs import Recording, RecordingError
 from vical_daemon.offline.errors import InputError, OptionError
 from vical_daemon.offline.td_icp.recorded_orientations import pose_topic, trajectory_file

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.temporal.delay_windows import DelayReport, delay_windows
-from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.temporal.track_registration import track_registration
 from vical_daemon.logs import Recording
 from vical_daemon.offline.errors import InputError, OptionError

@@ -14,7 +14,7 @@ from vical_daemon.estimation.init.intrinsics_start import LensFit, estimate_intr
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.temporal.camera_orientations import Orientations, target_orientations
-from vical_daemon.estimation.temporal.td_icp import OrientationStream
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.logs import Recording, Stream
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore, size_unknown

@@ -103,3 +103,9 @@ def test_right_jacobian_has_no_step_where_the_series_takes_over():
     for f in (so3.right_jacobian, so3.right_jacobian_inverse):
         below, above = f(axis * (0.3 - 1e-13)), f(axis * (0.3 + 1e-13))
         np.testing.assert_allclose(below, above, atol=1e-12)
+
+
+def test_turn_between_two_orientations_is_that_of_scipy_in_the_frame_of_the_first():
+    a, b = Rotation.random(50, rng=4), Rotation.random(50, rng=5)
+    found = so3.turn_between(*(np.roll(x.as_quat(), 1, axis=-1) for x in (a, b)))
+    np.testing.assert_allclose(found, (a.inv() * b).as_rotvec(), atol=1e-13)

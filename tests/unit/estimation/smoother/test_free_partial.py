@@ -15,8 +15,7 @@ from benchmarks.verify import Plan
 from tests.unit.estimation.test_target_free import subject_for
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
-from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError
+from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, mounting_about, still_axis
 
 MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
 

@@ -6,7 +6,7 @@ import pytest
 
 from vical_daemon.estimation.guidance import Block, Guidance, Verb, WeakDirection
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.status.steady_status import SteadyStatus, Verdict
+from vical_daemon.estimation.status.evaluator import SteadyStatus, Verdict
 
 CONVERGED = Verdict(Status.CONVERGED)
 DOUBT = Verdict(Status.CONVERGING, "the time shift still moves", Guidance(Verb.TURN, ("x",)))

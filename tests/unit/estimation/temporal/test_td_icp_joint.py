@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation.temporal.td_icp import (
-    OrientationStream,
-    _thinned,
-    joint_of_orientations,
-    joint_with_gyro,
-)
-from vical_daemon.estimation.temporal.td_icp_input import clean_stream
+from vical_daemon.estimation.temporal.td_icp import _thinned, joint_of_orientations, joint_with_gyro
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream, clean_stream
 
 DEG = np.pi / 180
 F = np.random.default_rng(1).uniform(0.25, 0.9, (3, 3))

@@ -11,7 +11,7 @@ from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.delay_windows import delay_windows
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve
-from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 from vical_daemon.estimation.temporal.track_orientations import relative_rotations, track_orientations
 
 

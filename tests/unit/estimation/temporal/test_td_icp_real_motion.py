@@ -11,7 +11,8 @@ from vical_daemon.estimation.temporal.rotation_turns import (
     without_long_rest,
 )
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
-from vical_daemon.estimation.temporal.td_icp import OrientationStream, joint_of_orientations, td_icp
+from vical_daemon.estimation.temporal.td_icp import joint_of_orientations, td_icp
+from vical_daemon.estimation.temporal.td_icp_input import OrientationStream
 
 DEG = np.pi / 180
 R_IMU_CAM = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
