@@ -208,7 +208,7 @@ def what_jumped(before: CalibrationFilter, taken: Sequence[Taken], camera: str, 
         if possible & others:
             possible.discard(part)
     best = max(possible, key=lambda part: found[part].likelihood)
-    k = found[best].at
+    k = min(found[part].at for part in possible)  # images before it are from before any of the jumps
     if possible == {Part.TARGET}:
         return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k])
     unknown = {part: found[part].sizes for part in possible}
