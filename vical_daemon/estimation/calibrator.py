@@ -378,7 +378,8 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
-        found = what_jumped(before, self._past.since(), camera, self._step)
+        after_gap = self._change is None and self.watch.motion_is_new(before.state.t_s)
+        found = what_jumped(before, self._past.since(), camera, self._step, after_gap=after_gap)
         if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):
             return False
         part, possible, f, known = found

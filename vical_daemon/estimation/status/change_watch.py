@@ -114,19 +114,24 @@ class ChangeWatch:
     _suspected: int = 0  # images since something may have changed; 0: nothing may
     _suspected_s: float = float("-inf")
     _ask_at: int = 0
-    _pose_taken_s: float = float("-inf")
+    _pose_taken_s: float = float("-inf")  # or looked for
+    _motion_taken_s: float = float("-inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
 
     def started(self) -> None:
         """A filter starts."""
         self.shift_reopened()
-        self._pose_taken_s = float("-inf")
+        self._pose_taken_s = self._motion_taken_s = float("-inf")
 
     def motion_restarted(self, t_s: float) -> None:
         """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
         self._refused.clear()
         self._closer = self._suspected = 0
-        self._pose_taken_s = t_s
+        self._pose_taken_s = self._motion_taken_s = t_s
+
+    def motion_is_new(self, t_s: float) -> bool:
+        """Whether the motion was taken from images within the last seconds."""
+        return t_s < self._motion_taken_s + _SOON_S
 
     def shift_reopened(self) -> None:
         """A time shift is to be found again: what is known of its drift no longer holds."""

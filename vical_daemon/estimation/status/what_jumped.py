@@ -166,7 +166,9 @@ class Found(NamedTuple):
     before: CalibrationFilter
 
 
-def what_jumped(before: CalibrationFilter, taken: Sequence[Taken], camera: str, step: Step) -> Found | None:
+def what_jumped(
+    before: CalibrationFilter, taken: Sequence[Taken], camera: str, step: Step, *, after_gap: bool = False
+) -> Found | None:
     """Find which part of the calibration of a camera jumped, or whether the target did.
 
     Args:
@@ -174,6 +176,8 @@ def what_jumped(before: CalibrationFilter, taken: Sequence[Taken], camera: str, 
         taken: Images since then, of all cameras, in order.
         camera: The one whose images do not fit.
         step: Takes an image with a filter.
+        after_gap: The motion was found again just before, with the mounting as known. A mounting that jumped
+            in the meantime looks like biases at first, so they are not considered.
 
     Returns:
         None where no jump explains the images.
@@ -185,6 +189,8 @@ def what_jumped(before: CalibrationFilter, taken: Sequence[Taken], camera: str, 
     none = sum(x.log_likelihood for x in taken)
     refused = [k for k, x in enumerate(taken) if not x.used]
     instants = _suspects(before, taken, camera, refused, odds)
+    if after_gap:
+        instants.pop(Part.BIASES, None)
     found: dict[Part, _Jump] = {}
     filters: dict[int, CalibrationFilter] = {}
     f, likelihood = deepcopy(before), 0.0
