@@ -11,20 +11,13 @@ which is exact for Gaussians: r is common to both sides, and the condition on it
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.retract import camera_difference
-from vical_daemon.estimation.model.state import CameraSlices, CameraState, Layout
-from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
-
-_WINDOWS = 5
-"""After which a mounting is compared with what it was: 15 s and more. Later the move is part of both."""
-_INFORMED = 0.02  # share of the variance that windows took away, below which they say nothing
+from vical_daemon.estimation.model.state import Layout
 
 
 def mounting(layout: Layout) -> tuple[int, ...]:
@@ -85,51 +78,3 @@ def _square(
     both = [*kept, *rest]
     e = A @ d[both]
     return float(e @ np.linalg.solve(C + A @ P[np.ix_(both, both)] @ A.T, e))
-
-
-class MountingWatch:
-    """Notices a mounting that moved by less than one window shows, from estimates some windows apart.
-
-    For consistent sigmas cov(new - old) = P_old - P_new. [Hausman, "Specification tests in econometrics", 1978]
-
-    Attributes:
-        doubtful: It may have moved.
-    """
-
-    def __init__(self) -> None:
-        self.doubtful = False
-        self._models: object = None
-        self._past: deque[tuple[CameraState, FloatArray]] = deque(maxlen=_WINDOWS)
-
-    def moved(
-        self, camera: CameraState, covariance: FloatArray, factor: float, where: CameraSlices, models: object
-    ) -> bool:
-        """Take what is known after a complete window; whether lever arm or mounting have surely moved.
-
-        Args:
-            camera: The calibration.
-            covariance: Of it, over its factor, shape (n, n).
-            factor: Measured variance over the stated one.
-            where: Where the errors of the camera live.
-            models: What is as specified: estimates with different models are not compared.
-        """
-        if models != self._models:
-            self._past.clear()
-            self._models = models
-        levels = {LIKELY_SIGMAS: False, SURE_SIGMAS: False}
-        for old, before in self._past:
-            d = camera_difference(camera, old, where, len(covariance))
-            for block in (where.position, where.rotation):
-                if block is None:
-                    continue
-                sigmas = np.sqrt(np.diag(before)[block])
-                less = before[block, block] - covariance[block, block]
-                share, axes = np.linalg.eigh(less / np.outer(sigmas, sigmas))
-                informed = share > _INFORMED
-                square = (((axes.T @ (d[block] / sigmas)) ** 2 / np.maximum(share, _INFORMED))[informed]).sum()
-                for level in levels:
-                    limit = chi_square_limit(max(int(informed.sum()), 1), level)
-                    levels[level] |= bool(square > factor * limit)
-        self._past.append((camera, covariance))
-        self.doubtful = levels[LIKELY_SIGMAS]
-        return levels[SURE_SIGMAS]

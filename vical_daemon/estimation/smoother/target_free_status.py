@@ -19,9 +19,9 @@ from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.changed_blocks import MountingWatch
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
+from vical_daemon.estimation.smoother.mounting_watch import MountingWatch, square_of_change
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
     Evaluator,
@@ -224,13 +224,9 @@ class TargetFreeStatus(Evaluator):
         after = fit.carry.at(carry.t_cam_s)
         clocks = self.models.clocks(fit.carry, self.factor())
         change, (P_old, P_new) = compared_by(carry, after, fit.change, clocks)
-        scale = np.sqrt(np.diag(P_old))
-        values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
-        informed = values > 0.02  # directions in which the window has information
-        if not informed.any():
+        statistic, dof = square_of_change(change, P_old, P_new)
+        if not dof:
             return True
-        d = vectors.T @ (change / scale)
-        statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
         agree = self.excess(statistic, dof) <= 1.0
         self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
