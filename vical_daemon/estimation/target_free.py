@@ -386,6 +386,9 @@ class TargetFreeCalibrator:
             self.latest, self._noise = fit.carry, fit.noise
         self._closed += 1
         self.evaluator.closed()
+        if self.evaluator.moved(fit.carry):
+            self._forget()
+            return
         self._learn_lens(window, bundle, fit)
         if self.window_closed is not None:
             self.window_closed(window, fit)

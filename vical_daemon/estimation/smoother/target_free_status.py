@@ -21,6 +21,7 @@ from vical_daemon.estimation.smoother.alternative_models import AlternativeModel
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
+from vical_daemon.estimation.smoother.mounting_watch import MountingWatch, square_of_change
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
     Evaluator,
@@ -37,6 +38,7 @@ _MOST_INERTIAL = 2.5  # likewise, rms of the inertial residuals in their sigmas
 _MOST_REFUSED = 0.4  # likewise, share of the sightings left out: with half, either half may be right
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0  # of the variance: sigmas ten times too small are no scatter but a change
+_MOUNTING_IN_DOUBT = "the mounting still moves: waiting to see whether the camera was moved"
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
@@ -65,6 +67,7 @@ class TargetFreeStatus(Evaluator):
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling)
+        self._mounting = MountingWatch()
         self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
@@ -134,6 +137,7 @@ class TargetFreeStatus(Evaluator):
             self.announce_all(_changes(self.camera, change, self.layout))
         self._quiet, self.models.drifting = (Cause.NONE, None), False
         self._windows, self._against_since_s = 0, None
+        self._mounting = MountingWatch()
         self._squares.clear()
         self._growing = 0.0, 0
 
@@ -197,6 +201,15 @@ class TargetFreeStatus(Evaluator):
         self._against_since_s = None
         self._announce_jitter(self.camera, self.jitter_s)
 
+    def moved(self, carry: MarginalPrior) -> bool:
+        """Whether a complete window shows, with those before it, that the mounting has moved."""
+        if self._windows < _LEARNING:
+            return False
+        models = self.models.weighed(carry, self.factor(), bool(self._squares))
+        camera, S = models.averaged
+        likely = max(models.weights, key=lambda name: models.weights[name])
+        return self._mounting.moved(camera, S @ S.T, self.factor(), self.layout.camera, likely)
+
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
 
@@ -211,13 +224,9 @@ class TargetFreeStatus(Evaluator):
         after = fit.carry.at(carry.t_cam_s)
         clocks = self.models.clocks(fit.carry, self.factor())
         change, (P_old, P_new) = compared_by(carry, after, fit.change, clocks)
-        scale = np.sqrt(np.diag(P_old))
-        values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
-        informed = values > 0.02  # directions in which the window has information
-        if not informed.any():
+        statistic, dof = square_of_change(change, P_old, P_new)
+        if not dof:
             return True
-        d = vectors.T @ (change / scale)
-        statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
         agree = self.excess(statistic, dof) <= 1.0
         self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
@@ -272,6 +281,7 @@ class TargetFreeStatus(Evaluator):
             lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
             doubt = self.models.reason(carry, self.factor(), believed=self.believed)
             doubt = doubt or (CLOCKS_IN_DOUBT if self._clock_wanders else "")
+            doubt = doubt or (_MOUNTING_IN_DOUBT if self._mounting.doubtful else "")
             self.believed &= not doubt
             reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
             cameras, missing = {self.camera: camera}, {self.camera: weak}

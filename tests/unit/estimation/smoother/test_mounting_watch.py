@@ -1,0 +1,88 @@
+"""Without a target, a camera that moves by less than one window shows is noticed; honest estimates are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+from vical_mocks.rig import Bump, reference_rig
+from vical_mocks.tracks import room_landmarks, simulate_tracks
+
+from tests.unit.estimation.smoother.test_changes import followed
+from tests.unit.estimation.some_layout import window_layout
+from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.mounting_watch import MountingWatch, square_of_change
+
+WINDOW_SIGMA_M = 2e-3  # of one window alone
+CAMERA = CameraState(
+    np.eye(3), np.zeros(3), 0.0, np.array([500.0, 500.0, 320.0, 240.0]), np.zeros(4), "radtan", (640, 480)
+)
+
+
+def estimates(seed, count, move_m=0.0, at=0):
+    """Lever arms of a recursive estimator, and its covariances; from window `at` on the camera has moved."""
+    rng, layout = np.random.default_rng(seed), window_layout()
+    where = layout.camera
+    information, vector, out = 0.0, np.zeros(3), []
+    for k in range(count):
+        measured = WINDOW_SIGMA_M * rng.standard_normal(3) + (move_m if k >= at else 0.0) / np.sqrt(3.0)
+        information, vector = information + WINDOW_SIGMA_M**-2, vector + measured * WINDOW_SIGMA_M**-2
+        P = 1e-12 * np.eye(layout.size)
+        P[where.position, where.position] = np.eye(3) / information
+        out.append((replace(CAMERA, p_imu_cam=vector / information), P))
+    return out, where
+
+
+def test_the_square_of_an_honest_change_is_chi_square():
+    squares = []
+    for seed in range(400):
+        ((old, before), *_, (new, after)), where = estimates(seed, 4)
+        d, at = new.p_imu_cam - old.p_imu_cam, where.position
+        square, dof = square_of_change(d, before[at, at], after[at, at])
+        assert dof == 3
+        squares.append(square)
+    assert kstest(squares, "chi2", args=(3,)).pvalue > 0.01
+
+
+def test_honest_estimates_are_never_surely_moved_and_rarely_doubted():
+    moved, doubted = 0, 0
+    for seed in range(100):
+        watch = MountingWatch()
+        shots, where = estimates(seed, 30)
+        for camera, P in shots:
+            moved += watch.moved(camera, P, 1.0, where, "all")
+            doubted += watch.doubtful
+    assert moved == 0
+    assert doubted <= 6  # of 3000, five comparisons each at 6e-5: 0.9 are expected
+
+
+@pytest.mark.parametrize(("move_m", "windows"), [(0.02, 1), (0.01, 4)])
+def test_a_move_is_noticed_after_some_windows(move_m, windows):
+    watch, (shots, where) = MountingWatch(), estimates(3, 20, move_m, at=10)
+    surely = [watch.moved(camera, P, 1.0, where, "all") for camera, P in shots]
+    assert not any(surely[:10])
+    assert any(surely[10 : 10 + windows])
+
+
+def test_answers_with_other_models_are_not_compared():
+    watch, (shots, where) = MountingWatch(), estimates(3, 12, 0.02, at=11)
+    for k, (camera, P) in enumerate(shots):
+        assert not watch.moved(camera, P, 1.0, where, "imu off" if k == 11 else "all")
+    assert not watch.doubtful
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_camera_that_moves_by_4_mm_is_noticed(seed):
+    """It had stayed `converged` beyond 5 sigma for 20 s: each window by itself agreed with what was known."""
+    rig = reference_rig(seed, bumps=(Bump(17.0, (0.0, 0.0, 0.0), (0.0025, -0.002, 0.0025)),))
+    record = followed(simulate_tracks(seed, 36.0, rig=rig, landmarks_m=room_landmarks(seed, 200)))
+    assert sum(e.kind is EventKind.BUMPED for _, e in record.events) == 1
+    far = [
+        shot.t_s
+        for shot in record.snapshots
+        if shot.status == "converged"
+        and shot.t_s > 17.0
+        and np.max(np.abs(shot.error[:7]) / np.sqrt(np.diag(shot.covariance)[:7])) > 5.0
+    ]
+    assert max(far, default=0.0) < 17.0 + 12.0
