@@ -262,7 +262,7 @@ class TargetFreeCalibrator:
         if self.evaluator.against_s > PATIENCE_S:
             return self._all_anew(buffer, frames)
         changed = self._after_change(buffer, frames, known)
-        return changed or self._with_new_biases(buffer, frames, known) or begun
+        return changed or self._new_biases(buffer, frames, known) or begun
 
     def _all_anew(self, buffer: ImuBuffer, frames: list[Stamped]) -> Begun | str:
         """Start a window from nothing: neither another mounting nor another clock explains the images."""
@@ -308,9 +308,7 @@ class TargetFreeCalibrator:
         self._seek_shift = self._confirmed = False
         return ended
 
-    def _with_new_biases(
-        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior
-    ) -> Begun | None:
+    def _new_biases(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | None:
         """Start a window that keeps all but the biases, as in another recording; None: it does not fit."""
         if self.latest is None or self._seek_shift:
             return None

@@ -1,4 +1,4 @@
-"""Without a target, a camera that moves by less than one window shows is noticed; honest estimates are not."""
+"""Without a target, a camera that moves by less than one window shows is noticed, and nothing else is."""
 
 from dataclasses import replace
 
