@@ -214,7 +214,7 @@ def what_jumped(
         if possible & others:
             possible.discard(part)
     best = max(possible, key=lambda part: found[part].likelihood)
-    k = min(found[part].at for part in possible)  # images before it are from before any of the jumps
+    k = found[best].at
     if possible == {Part.TARGET}:
         return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k])
     unknown = {part: found[part].sizes for part in possible}
