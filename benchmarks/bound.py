@@ -59,7 +59,7 @@ def _tracks(seed: int, seconds: float) -> SimulatedRun:
 CASES: dict[str, tuple[Callable[[int, float], SimulatedRun], BoundOptions]] = {
     "reference": (_board, BoundOptions(gravity="free")),
     "lens known": (_board, BoundOptions(gravity="free", intrinsics=False, distortion=False)),
-    "gravity magnitude known": (_board, BoundOptions()),
+    "gravity magnitude known": (_board, BoundOptions(gravity_sigma_mps2=1e-6)),
     "gravity known": (_board, BoundOptions(gravity="known")),
     "0.1 px": (_board, BoundOptions(gravity="free", corner_sigma_px=0.1)),
     "clocks apart": (_board, BoundOptions(gravity="free", drift_prior=1e-4)),

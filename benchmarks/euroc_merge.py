@@ -41,13 +41,11 @@ class Gravity:
 
     Attributes:
         vector: m/s^2, shape (3,).
-        tilt: Directions of its errors, shape (3, 2).
-        covariance: Of these, by the filter, rad^2, shape (2, 2).
+        covariance: By the filter, shape (3, 3).
         factor: By how much the stated variances are larger, because errors last.
     """
 
     vector: FloatArray
-    tilt: FloatArray
     covariance: FloatArray
     factor: float
 
@@ -55,15 +53,18 @@ class Gravity:
     def of(cls, f: CalibrationFilter) -> Gravity:
         """As a filter has it."""
         covariance = f.covariance([*range(GRAVITY.start, GRAVITY.stop)])
-        return cls(f.state.gravity.copy(), f.state.tilt.copy(), covariance, f.consistency["cam0"].factor)
+        return cls(f.state.gravity.copy(), covariance, f.consistency["cam0"].factor)
 
     def print_difference(self, other: Gravity) -> None:
-        """Angles between both, and in sigmas."""
-        d = self.tilt.T @ np.cross(self.vector, other.vector) / (self.vector @ self.vector)
-        own = np.sqrt(np.diag(self.covariance + other.covariance))
-        stated = np.sqrt(np.diag(self.factor * self.covariance + other.factor * other.covariance))
+        """Turns about two axes across gravity and the change of its size, and in sigmas."""
+        size = float(np.linalg.norm(self.vector))
+        axes = np.linalg.svd(self.vector[None] / size)[2]
+        d = axes @ (other.vector - self.vector)
+        own = np.sqrt(np.diag(axes @ (self.covariance + other.covariance) @ axes.T))
+        reported = self.factor * self.covariance + other.factor * other.covariance
+        stated = np.sqrt(np.diag(axes @ reported @ axes.T))
         cells = [np.round(x, 1).tolist() for x in (1e3 * d, d / own, d / stated)]
-        print("\ngravity, second half from first: {} mrad, {} of its sigmas, {} as stated".format(*cells))
+        print("\ngravity, second half from first: {} mm/s^2, {} of its sigmas, {} as stated".format(*cells))
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def job_of(folders: list[Path]) -> Job:
 
 
 def bound_of(run: SimulatedRun) -> Bound:
-    """The bound at the end of a recording, lens and magnitude of gravity known, as the filter has them."""
+    """The bound at the end of a recording, lens known, as the filter has it."""
     options = BoundOptions(intrinsics=False, distortion=False, corner_sigma_px=run.options.corner_sigma_px)
     return bounds(run, options, [run.duration_s])[-1]
 

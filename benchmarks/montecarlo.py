@@ -17,13 +17,14 @@ from vical_mocks.harness.feed import (
     Record,
     StartErrors,
     Subject,
+    assumed_gravity_mps2,
     camera_prior,
     feed,
     imu_noise,
     nees,
 )
 from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
-from vical_mocks.rig import reference_rig
+from vical_mocks.rig import STANDARD_GRAVITY_MPS2, reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from benchmarks import runner, scores
@@ -50,7 +51,7 @@ class Case:
         start: Errors of the starting values.
         timeshift_s: True time shift; None: uniform in +-50 ms, by seed.
         skew_ppm: Drift of the camera's clock.
-        gravity_error_mps2: Added to the magnitude that the estimator is given.
+        gravity_error_mps2: Of the magnitude that the estimator assumes; None: drawn from its prior.
         target_free: Landmarks instead of a board.
         random_mounting: The camera points anywhere on the imu, 20 cm away.
         trials: How many by default.
@@ -71,7 +72,7 @@ class Case:
     start: StartErrors = field(default_factory=StartErrors)
     timeshift_s: float | None = None
     skew_ppm: float = 0.0
-    gravity_error_mps2: float = 0.0
+    gravity_error_mps2: float | None = None
     target_free: bool = False
     random_mounting: bool = False
     trials: int = 100
@@ -204,11 +205,14 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
         prior = with_lens_off(prior, seed, stated=case.lens_off == "stated")
     if not case.readout_known:
         prior = replace(prior, readout_s=0.0)
+    gravity_mps2 = assumed_gravity_mps2(seed)
+    if case.gravity_error_mps2 is not None:
+        gravity_mps2 = STANDARD_GRAVITY_MPS2 + case.gravity_error_mps2
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if case.lens_known else frozenset(),
         estimate=case.estimate,
         target_free=case.target_free,
-        gravity_mps2=9.80665 + case.gravity_error_mps2,
+        gravity_mps2=gravity_mps2,
         imu_noise=imu_noise(run),
     )
     if kind == "ekf":

@@ -13,7 +13,15 @@ from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
-from vical_mocks.harness.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from vical_mocks.harness.feed import (
+    PARAMETERS,
+    CalibratorSubject,
+    StartErrors,
+    assumed_gravity_mps2,
+    camera_prior,
+    feed,
+    imu_noise,
+)
 from vical_mocks.random_rigs import draw, draw_all_off, draw_sampling
 
 from benchmarks import runner, scores
@@ -34,6 +42,7 @@ def trial(target_free: bool, imu_off: bool, all_off: bool, seconds: float, seed:
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if known else frozenset(),
         target_free=target_free,
+        gravity_mps2=assumed_gravity_mps2(seed),
         imu_noise=imu_noise(run),
     )
     subject = CalibratorSubject(options, prior, None if target_free else board_m)

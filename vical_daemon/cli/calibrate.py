@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         type=float,
         metavar="G",
         default=9.80665,
-        help="local gravity, m/s^2: 9.78 at the equator, 9.83 at the poles (default 9.80665)",
+        help="local gravity, m/s^2: 9.78 at the equator, 9.83 at the poles (default 9.80665 +- 0.015)",
     )
     parser.add_argument("--report", metavar="F.html", help="write a report, one HTML file")
     parser.add_argument(

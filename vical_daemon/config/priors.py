@@ -29,6 +29,7 @@ from vical_daemon.estimation.measurements import (
     ConvergenceTargets,
     FloatArray,
     ImuNoise,
+    gravity_sigma_mps2,
 )
 
 Density = Annotated[float, Bound(above=0, high=10.0)]
@@ -178,6 +179,7 @@ def calibration_options(config: Config) -> CalibrationOptions:
         estimate=frozenset(calibration.estimate),
         target_free=calibration.mode == "target_free",
         gravity_mps2=calibration.gravity_mps2,
+        gravity_sigma_mps2=gravity_sigma_mps2(calibration.gravity_mps2),
         corner_sigma_px=calibration.corner_sigma_px,
         imu_noise=noise,
         targets=ConvergenceTargets(

@@ -151,6 +151,16 @@ class ConvergenceTargets:
     timeshift_s: float = 5e-4
 
 
+STANDARD_GRAVITY_MPS2, _ASSUMED_SIGMA_MPS2 = 9.80665, 0.015
+"""Gravity where nobody says: at sea level it is 9.780 (equator) to 9.832 (poles) [WGS 84]."""
+_STATED_SIGMA_MPS2 = 3e-3  # of gravity that somebody states: the value of the place, rounded to two decimals
+
+
+def gravity_sigma_mps2(stated_mps2: float) -> float:
+    """How well the magnitude of gravity is known, one sigma, m/s^2, where this value is stated."""
+    return _ASSUMED_SIGMA_MPS2 if stated_mps2 == STANDARD_GRAVITY_MPS2 else _STATED_SIGMA_MPS2
+
+
 @dataclass(frozen=True, slots=True)
 class CalibrationOptions:
     """Switches of the estimator; names as on the command line.
@@ -162,6 +172,7 @@ class CalibrationOptions:
         target_free: Landmarks are estimated, no target is known.
         target_alike: A half turn maps the target onto itself, and its ids do not tell which end is up.
         gravity_mps2: Magnitude of gravity, m/s^2.
+        gravity_sigma_mps2: How well it is known, m/s^2, one sigma.
         corner_sigma_px: First guess of the corner noise; measured from the data afterwards.
         imu_noise: Densities of the IMU.
         targets: What counts as converged.
@@ -171,7 +182,8 @@ class CalibrationOptions:
     estimate: frozenset[str] = frozenset()
     target_free: bool = False
     target_alike: bool = False
-    gravity_mps2: float = 9.80665
+    gravity_mps2: float = STANDARD_GRAVITY_MPS2
+    gravity_sigma_mps2: float = _ASSUMED_SIGMA_MPS2
     corner_sigma_px: float = 0.5
     imu_noise: ImuNoise = field(default_factory=ImuNoise)
     targets: ConvergenceTargets = field(default_factory=ConvergenceTargets)

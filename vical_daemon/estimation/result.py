@@ -136,7 +136,8 @@ class CalibrationEstimate:
         imu_samples: Inertial samples used.
         cameras: By camera name; empty before the first solution.
         imu: Biases; None before the first solution.
-        gravity_world_mps2: Acceleration of free fall in the world (target) frame, m/s^2; [] before.
+        gravity_world_mps2: Acceleration of free fall in the world (target) frame, m/s^2, of the size that was
+            stated; [] before.
         nis_per_dof: Mean normalised innovation squared per degree of freedom; 1 when consistent.
         rejected_fraction: Share of measurements that the gates refused.
         events: Announcements since the last estimate.

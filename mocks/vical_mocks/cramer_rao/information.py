@@ -38,6 +38,7 @@ class BoundOptions:
         imu_matrix_prior: Prior of each entry of the gyro (9) and accelerometer (6, lower triangle)
             matrices; 0: known.
         gravity: "free" (three numbers), "magnitude" (its direction is unknown) or "known".
+        gravity_sigma_mps2: One-sigma prior of its magnitude.
         target_free: World points are unknown; the first pose fixes the world.
     """
 
@@ -53,6 +54,7 @@ class BoundOptions:
     target_scale_prior: float = 0.0
     imu_matrix_prior: float = 0.0
     gravity: str = "magnitude"
+    gravity_sigma_mps2: float = 0.015
     target_free: bool = False
 
 
@@ -111,7 +113,7 @@ class Information:
         if options.gravity == "magnitude":
             place = constants.slices["gravity"]
             direction = rig.gravity_world_mps2 / np.linalg.norm(rig.gravity_world_mps2)
-            self.matrix[place, place] += np.outer(direction, direction) / 1e-6**2
+            self.matrix[place, place] += np.outer(direction, direction) / options.gravity_sigma_mps2**2
 
     def propagate(self, transition: FloatArray, inputs: FloatArray, noise: FloatArray) -> None:
         """Move from one frame's state to the next.

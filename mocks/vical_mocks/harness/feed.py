@@ -301,6 +301,13 @@ def camera_prior(run: SimulatedRun, seed: int, errors: StartErrors, *, exact_len
     )
 
 
+def assumed_gravity_mps2(seed: int) -> float:
+    """Magnitude of gravity that an estimator assumes, as far from the true one as its prior says."""
+    known = CalibrationOptions()
+    rng = np.random.default_rng([seed, 980665])
+    return known.gravity_mps2 + known.gravity_sigma_mps2 * float(rng.standard_normal())
+
+
 def imu_noise(run: SimulatedRun) -> ImuNoise:
     """The densities that the data were made with."""
     d = run.rig.densities

@@ -10,7 +10,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
-from vical_daemon.estimation.model.state import LOWER, CameraState, State, make_layout
+from vical_daemon.estimation.model.state import GRAVITY, LOWER, CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
@@ -69,7 +69,9 @@ def some_filter(imu=1.0, target=0.0, lag=0.0, size=0.0, factor=1.0, scale=1.0):
     sigmas = {IMU: ENTRY_SIGMA, LAG: LAG_SIGMA_S, SIZE: SIZE_SIGMA, TARGET: layout.target_modes.sigma_m}
     for name, of_prior in sigmas.items():
         sigma[where[name]] = of_prior
-    H, truth, noise = rng.normal(size=(2 * n, n)), np.zeros(n), 8e-3
+    H, truth, noise = rng.normal(size=(2 * n - 2, n - 1)), np.zeros(n), 8e-3
+    by_gravity = np.random.default_rng(6).normal(size=len(H))  # apart: sizes in tests are for the other draws
+    H = np.insert(H, GRAVITY.stop - 1, by_gravity, axis=1)
     truth[where[IMU]] = imu * 0.5 * ENTRY_SIGMA * rng.normal(size=15)
     truth[where[TARGET]] = target * 0.5 * layout.target_modes.sigma_m * rng.normal(size=11)
     truth[where[LAG]] = lag * 0.5 * LAG_SIGMA_S

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from vical_daemon.estimation.filter import noise_updates
 from vical_daemon.estimation.filter.image_update import (
@@ -56,7 +57,7 @@ from vical_daemon.estimation.model.state import (
     Layout,
     MotionStart,
     State,
-    tilt_basis,
+    gravity_root,
 )
 from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
@@ -328,6 +329,10 @@ class CalibrationFilter:
             x, y, z = (0.5 * dx[s]).tolist()
             if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
                 unscented.turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
+        g = self.state.gravity
+        turn = np.cross(g, dx[GRAVITY]) / (g @ g)
+        if max(abs(turn)) > 2.0 * _TURNED_RAD:
+            unscented.turn_rows(S, GRAVITY, so3.exp_one(turn))
         self.S = S
         self.state = retract(self.state, self.layout, dx)
 
@@ -403,23 +408,23 @@ class CalibrationFilter:
             motion: Where the rig is, independent of all that the filter knows; of another recording also its
                 biases and gravity.
         """
-        state, dt, sigmas = self.state, motion.elapsed_s, motion.sigmas
+        state, dt, root = self.state, motion.elapsed_s, np.diag(motion.sigmas)
+        if motion.turned is not None:
+            self._turn_gravity(motion.turned)
+        size_rows = np.zeros((0, self.layout.size))  # gravity has the size that it had
         if motion.biases is not None:
             b = motion.biases
-            state.gyro_bias, state.accel_bias = b.gyro_bias, b.accel_bias
-            state.gravity, state.tilt = b.gravity, tilt_basis(b.gravity)
-            sigmas = np.concatenate(
-                [sigmas, np.repeat([b.gyro_bias_sigma, b.accel_bias_sigma, b.gravity_sigma], (3, 3, 2))]
-            )
-        if motion.turned is not None:
-            state.gravity, state.tilt = motion.turned @ state.gravity, motion.turned @ state.tilt
-            turned_rad = float(np.linalg.norm(so3.log(motion.turned)))
-            self.inflate_covariance(turned_rad * np.eye(self.layout.size)[:, GRAVITY])  # or it is the imu
-        new = len(sigmas)  # motion, or all up to gravity
+            sigmas = np.repeat([b.gyro_bias_sigma, b.accel_bias_sigma], 3)
+            root = block_diag(root, np.diag(sigmas), gravity_root(b.gravity, b.gravity_sigma, 0.0))
+            before, after = (g / np.linalg.norm(g) for g in (state.gravity, b.gravity))
+            size_rows = np.outer(after, before @ self.S[GRAVITY])
+            state.gyro_bias, state.accel_bias, state.gravity = b.gyro_bias, b.accel_bias, b.gravity
+        new = len(root)  # motion, or all up to gravity
         A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, new))], axis=1)
         self._drift_shifts(A, dt)
         A[:new] = 0.0
-        A[:new, -new:] = np.diag(sigmas)
+        A[new - len(size_rows) : new, : self.layout.size] = size_rows
+        A[:new, -new:] = root
         before, self.S = self.S, unscented.lower_root(A)
         self.passed.append(Moved(before, self.S, np.zeros((9, self.layout.dynamic)), dt))
         self.arm_score = None
@@ -427,6 +432,15 @@ class CalibrationFilter:
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
         for consistency in self.consistency.values():
             consistency.settle()
+
+    def _turn_gravity(self, turned: FloatArray) -> None:
+        """The target seems to have turned, shape (3, 3), against gravity; or it is the imu that did."""
+        state, in_doubt = self.state, np.zeros((self.layout.size, 3))
+        state.gravity = turned @ state.gravity
+        in_doubt[GRAVITY] = gravity_root(state.gravity, float(np.linalg.norm(so3.log(turned))), 0.0)
+        self.S = self.S.copy()  # `passed` refers to it
+        self.S[GRAVITY] = turned @ self.S[GRAVITY]
+        self.inflate_covariance(in_doubt)
 
     def _random_walk(self, dt: float, after: int = 0) -> FloatArray:
         """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros, (n, k)."""

@@ -111,8 +111,7 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     errors = influence(R, relative)
     F = np.zeros((9, len(S)))
     F[:, : BIASES.stop] = motion_slopes(state, relative, errors)
-    tilt = -so3.hat(g) @ state.tilt
-    F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
+    F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * so3.IDENTITY, T * so3.IDENTITY
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         readings = np.concatenate([segment.gyro - state.gyro_bias, segment.accel - state.accel_bias], axis=1)
         by = by_entries(errors, readings, state.gyro_matrix, state.accel_matrix)

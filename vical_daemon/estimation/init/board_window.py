@@ -340,10 +340,10 @@ class BoardWindow:
         numbers = _numbers(s)
         e, J = links.errors(R, p, v, np.broadcast_to(numbers, (len(R) - 1, len(numbers))), s.gravity)
         T = links.dt[:, None, None]
-        tilt = np.swapaxes(R[:-1], 1, 2) @ (-so3.hat(s.gravity) @ s.tilt)
-        by_tilt = np.concatenate([np.zeros_like(tilt), -T * tilt, -0.5 * T * T * tilt], axis=1)
+        Rt = np.swapaxes(R[:-1], 1, 2)
+        by_gravity = np.concatenate([np.zeros_like(Rt), -T * Rt, -0.5 * T * T * Rt], axis=1)
         full = np.zeros((len(e), 9, layout.size))
-        full[:, :, GRAVITY] = links.root @ by_tilt
+        full[:, :, GRAVITY] = links.root @ by_gravity
         full[:, :, BIASES] = J[:, :, 18:24]
         if layout.gyro_matrix is not None and layout.accel_matrix is not None:
             full[:, :, layout.gyro_matrix.start : layout.accel_matrix.stop] = J[:, :, 24:39]

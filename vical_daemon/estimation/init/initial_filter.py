@@ -36,6 +36,7 @@ from vical_daemon.estimation.model.state import (
     Layout,
     MotionStart,
     State,
+    gravity_root,
 )
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
@@ -71,6 +72,7 @@ def initial_filter(
     walk = np.zeros(layout.size)
     off = {IMU, LAG, SIZE, SIZE_EFFECT, TARGET} & options.estimate
     root = np.diag(filter_sigmas(state, layout, off))
+    root[GRAVITY, GRAVITY] = gravity_root(state.gravity, GRAVITY_SIGMA_RAD, options.gravity_sigma_mps2)
     unobservable = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
     if unobservable is not None:
         for where in layout.cameras.values():
@@ -121,7 +123,7 @@ def _without_arm(camera: CameraState, where: CameraSlices) -> CameraState:
 
 
 def filter_sigmas(state: State, layout: Layout, off: set[str]) -> FloatArray:
-    """Standard deviations the filter starts with: many times what the start is really worth.
+    """Standard deviations the filter starts with, but for gravity: many times what the start is worth.
 
     The images of the start are filtered again: with its own (small) sigmas they would count twice. A lever
     arm that is not known leaves the position of the IMU as unknown.
@@ -135,5 +137,5 @@ def filter_sigmas(state: State, layout: Layout, off: set[str]) -> FloatArray:
         size_sigma=KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA,
     )
     s[ATTITUDE], s[POSITION], s[VELOCITY] = start.attitude_rad, 3.0 * UNKNOWN_M, start.velocity_mps
-    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
+    s[GYRO_BIAS], s[ACCEL_BIAS] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2
     return s

@@ -22,10 +22,11 @@ from vical_daemon.estimation.model.state import (
     CameraState,
     Layout,
     State,
+    gravity_difference,
     grp_from_rotation,
+    moved_gravity,
     rotation_from_grp,
     rotation_of_grp,
-    tilted_gravity,
 )
 
 
@@ -71,7 +72,7 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         state.v_world_imu + errors[:, VELOCITY],
         state.gyro_bias + errors[:, GYRO_BIAS],
         state.accel_bias + errors[:, ACCEL_BIAS],
-        tilted_gravity(state.gravity, state.tilt, errors[:, GRAVITY]),
+        moved_gravity(state.gravity, errors[:, GRAVITY]),
         gyro_matrix,
         accel_matrix,
         positions,
@@ -126,7 +127,6 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     shape = state.target_shape
     if layout.target_shape is not None:
         shape = shape + dx[layout.target_shape]
-    tilted = rotation_of_grp(state.tilt @ dx[GRAVITY])
     return State(
         state.t_s,
         orthonormal(state.R_world_imu @ rotation_of_grp(dx[ATTITUDE])),
@@ -134,7 +134,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         state.v_world_imu + dx[VELOCITY],
         state.gyro_bias + dx[GYRO_BIAS],
         state.accel_bias + dx[ACCEL_BIAS],
-        tilted @ state.gravity,
+        moved_gravity(state.gravity, dx[GRAVITY]),
         {name: moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
         gyro_matrix,
         accel_matrix,
@@ -142,7 +142,6 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         lag_s,
         scale,
         shape,
-        tilted @ state.tilt,
     )
 
 
@@ -155,9 +154,7 @@ def difference(state: State, origin: State, layout: Layout) -> FloatArray:
         state.v_world_imu - origin.v_world_imu,
     )
     dx[GYRO_BIAS], dx[ACCEL_BIAS] = state.gyro_bias - origin.gyro_bias, state.accel_bias - origin.accel_bias
-    across = np.cross(origin.gravity, state.gravity)
-    sine, cosine = float(np.linalg.norm(across)), float(origin.gravity @ state.gravity)
-    dx[GRAVITY] = origin.tilt.T @ across * (np.arctan2(sine, cosine) / max(sine, 1e-12))
+    dx[GRAVITY] = gravity_difference(state.gravity, origin.gravity)
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         dx[layout.gyro_matrix] = (state.gyro_matrix - origin.gyro_matrix).ravel()
         dx[layout.accel_matrix] = (state.accel_matrix - origin.accel_matrix)[LOWER[:, 0], LOWER[:, 1]]

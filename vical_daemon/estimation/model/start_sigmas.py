@@ -19,6 +19,7 @@ def start_sigmas(
     *,
     imu_sigma: float,
     size_sigma: float = 0.0,
+    gravity_sigma_mps2: float = 0.0,
 ) -> FloatArray:
     """Standard deviations of the constants: many times what a start is worth; zero for the core; shape (n,).
 
@@ -28,8 +29,11 @@ def start_sigmas(
         start: Of the cameras.
         imu_sigma: Of the entries of the imu's matrices.
         size_sigma: Of the size of the target, relative.
+        gravity_sigma_mps2: Of the magnitude of gravity, of a window.
     """
     s = np.zeros(layout.size)
+    if layout.gravity is not None:
+        s[layout.gravity] = gravity_sigma_mps2
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = imu_sigma
     if layout.accel_positions is not None:

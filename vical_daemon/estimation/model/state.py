@@ -7,6 +7,7 @@ parameters; equal to the rotation vector for small angles), local (right): R = R
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -26,8 +27,8 @@ VELOCITY = slice(6, 9)  # m/s, in world
 GYRO_BIAS = slice(9, 12)  # rad/s
 ACCEL_BIAS = slice(12, 15)  # m/s^2
 BIASES = slice(9, 15)  # rad/s, then m/s^2
-GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
-CORE = 17  # numbers of these
+GRAVITY = slice(15, 18)  # m/s^2, in the world; see `moved_gravity`
+CORE = 18  # numbers of these
 
 LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
 LOWER_FLAT = 3 * LOWER[:, 0] + LOWER[:, 1]  # the same among its nine numbers, row by row
@@ -48,14 +49,15 @@ class CameraSlices:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Order of the error state: [core | imu matrices | accel lag | cameras | target scale | target shape].
+    """Order of the error state: [core | gravity | imu | cameras | target scale | target shape].
 
     The core is what moves, biases and gravity: of the filter as above, of a window see `MarginalPrior`.
 
     Attributes:
         core: Length of the core.
         size: Length of the error state.
-        dynamic: Number of leading errors that enter the propagation (core, imu matrices and lag).
+        dynamic: Number of leading errors that enter the propagation (core, gravity and imu).
+        gravity: Its magnitude, m/s^2, index, of a window, whose world stands upright; None: see `GRAVITY`.
         gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
         accel_matrix: 6 entries (lower triangle) of M_a - I; the lower triangle fixes the gauge, since a
             full matrix could be traded against R_imu_cam.
@@ -71,6 +73,7 @@ class Layout:
     core: int
     size: int
     dynamic: int
+    gravity: int | None
     gyro_matrix: slice | None
     accel_matrix: slice | None
     accel_positions: slice | None
@@ -87,7 +90,7 @@ class Layout:
 
     @property
     def inertial(self) -> slice:
-        """Imu matrices and lag of the accelerometer, as far as they are estimated; see `imu_scale`."""
+        """Gravity of a window, and numbers of the imu (see `imu_scale`), as far as they are estimated."""
         return slice(self.core, self.dynamic)
 
     @property
@@ -136,6 +139,7 @@ def make_layout(
         core: Length of what comes before the constants.
     """
     places, held = _Places(core), dict(held or {})
+    gravity = places.one(core != CORE)
     imu = "imu_intrinsics" in estimate
     gyro_matrix, accel_matrix = places.block(imu, 9), places.block(imu, 6)
     accel_positions = places.block("size_effect" in estimate, 6)
@@ -152,6 +156,7 @@ def make_layout(
         core,
         places.used,
         dynamic,
+        gravity,
         gyro_matrix,
         accel_matrix,
         accel_positions,
@@ -231,7 +236,7 @@ class State:
         v_world_imu: Velocity, m/s.
         gyro_bias: rad/s.
         accel_bias: m/s^2.
-        gravity: Acceleration of free fall in the world, m/s^2; its length never changes.
+        gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         gyro_matrix: M_g in omega = M_g (omega_m - b_g).
         accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
         cameras: By name.
@@ -239,9 +244,6 @@ class State:
         accel_lag_s: The specific force stamped t is that of t - accel_lag_s; the gyro's stamps are right.
         target_scale: True size of the board over its stated size.
         target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
-        tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
-            They turn with it: a basis computed from gravity alone must jump somewhere, and the
-            covariance would not jump with it.
     """
 
     t_s: float
@@ -258,11 +260,6 @@ class State:
     accel_lag_s: float = 0.0
     target_scale: float = 1.0
     target_shape: FloatArray = field(default_factory=lambda: np.zeros(MODES))
-    tilt: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-
-    def __post_init__(self) -> None:
-        if not len(self.tilt):
-            self.tilt = tilt_basis(self.gravity)
 
     def __deepcopy__(self, memo: object) -> State:
         """With cameras of its own; arrays are shared, as every change of the state makes new ones."""
@@ -278,7 +275,7 @@ class BiasStart(NamedTuple):
         gravity: Acceleration of free fall in the world, m/s^2.
         gyro_bias_sigma: rad/s.
         accel_bias_sigma: m/s^2.
-        gravity_sigma: Of its direction, rad.
+        gravity_sigma: Of its direction, rad. Its size is that of before.
     """
 
     gyro_bias: FloatArray
@@ -350,12 +347,31 @@ def grp_from_rotation(R: FloatArray) -> FloatArray:
     return out
 
 
-def tilt_basis(gravity: FloatArray) -> FloatArray:
-    """Two unit vectors across gravity to begin with, shape (3, 2): the directions in which it can tilt."""
-    basis: FloatArray = so3.tangents(gravity[None] / np.sqrt(gravity @ gravity))[0]
-    return basis
+def moved_gravity(gravity: FloatArray, d: FloatArray) -> FloatArray:
+    """Gravity moved by errors: what is along it changes its length, what is across turns it.
+
+    Added as vectors, errors of the direction would change the length, which is known a hundred times better.
+
+    Args:
+        gravity: m/s^2, shape (3,).
+        d: Errors, m/s^2, shape (..., 3).
+    """
+    length = math.sqrt(gravity @ gravity)
+    along = (d @ gravity / length)[..., None]
+    turned = gravity + d - along * gravity / length
+    return np.asarray((length + along) * turned / np.sqrt(np.vecdot(turned, turned))[..., None])
 
 
-def tilted_gravity(gravity: FloatArray, basis: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Turn gravity by small angles about `basis` keeping its length; tilt shape (..., 2), rad."""
-    return (rotation_from_grp(tilt @ basis.T) @ gravity[:, None])[..., 0]
+def gravity_difference(gravity: FloatArray, origin: FloatArray) -> FloatArray:
+    """Error that moves `origin` to `gravity`, m/s^2, shape (3,): the inverse of `moved_gravity`."""
+    length, now = math.sqrt(origin @ origin), math.sqrt(gravity @ gravity)
+    across = gravity * (length**2 / (gravity @ origin)) - origin
+    return np.asarray(across + (now - length) * origin / length)
+
+
+def gravity_root(gravity: FloatArray, direction_rad: float, size_mps2: float) -> FloatArray:
+    """Square root of the covariance of gravity known to these sigmas, m/s^2, shape (3, 3)."""
+    length = math.sqrt(gravity @ gravity)
+    up = gravity / length
+    along = up[:, None] * up
+    return np.asarray(size_mps2 * along + direction_rad * length * (np.eye(3) - along))

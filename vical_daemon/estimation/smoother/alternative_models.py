@@ -232,7 +232,7 @@ class AlternativeModels:
 
     def _blocks(self, carry: MarginalPrior) -> dict[str, Block]:
         """What is estimated apart from the calibration, by its name in `CalibrationOptions.estimate`."""
-        found = model_selection.imu_and_lenses(carry.layout, carry.imu, {self._camera: carry.camera})
+        found = model_selection.imu_and_lenses(carry.layout, carry.imu[1:], {self._camera: carry.camera})
         if carry.camera.term and self.lens is None:
             term = model_selection.lens_term(carry.layout, self._camera, carry.camera, held=True)
             found[term_block(self._camera)] = term

@@ -135,7 +135,8 @@ class FirstWindow:
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
         models, held = self._status.models, self.initializer.held
-        carry = initial_prior(window, known, self._layout, held, models.imu_sigma, self._prior, reopened)
+        sigmas = models.imu_sigma, self._options.gravity_sigma_mps2
+        carry = initial_prior(window, known, self._layout, held, *sigmas, self._prior, reopened)
         bundle = Bundle(window, carry, noise)
         return bundle, carry, bundle.solve(buffer, MOST_STEPS)
 

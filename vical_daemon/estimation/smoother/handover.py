@@ -35,6 +35,7 @@ def initial_prior(
     layout: Layout,
     held: FloatArray | None,
     imu_sigma: float,
+    gravity_sigma_mps2: float,
     given: CameraPrior,
     reopened: Collection[int] = (),
 ) -> MarginalPrior:
@@ -46,14 +47,16 @@ def initial_prior(
         layout: Where the errors live.
         held: Axis along which the lever arm is held, see `TargetFreeInitializer`.
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
+        gravity_sigma_mps2: Of the magnitude of gravity.
         given: What is known about the camera without any data.
         reopened: Errors of which nothing is known any more; of mounting and time shift.
     """
     centre = prior_centre(window.camera, given)
     (name,) = layout.cameras
-    wide = first_carry(
-        window, centre, layout, start_sigmas(layout, {name: centre}, WINDOW_START, imu_sigma=imu_sigma)
+    sigmas = start_sigmas(
+        layout, {name: centre}, WINDOW_START, imu_sigma=imu_sigma, gravity_sigma_mps2=gravity_sigma_mps2
     )
+    wide = first_carry(window, centre, layout, sigmas)
     if known is None:
         return wide if held is None else held_along(wide, held)
     unseen_s = max(wide.t_cam_s - known.t_cam_s, KNOT_S)
@@ -69,7 +72,7 @@ def initial_prior(
         window.camera = replace(found, timeshift_s=camera.timeshift_s)
     if where.position is not None and where.position.start in reopened:
         camera = replace(camera, R_imu_cam=found.R_imu_cam, p_imu_cam=found.p_imu_cam)
-    return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
+    return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera, imu=known.imu)
 
 
 def of_another_recording(known: MarginalPrior, window: Window, stepped_s: float) -> MarginalPrior:
@@ -120,10 +123,9 @@ def next_window(window: Window, carry: MarginalPrior) -> Window:
         np.zeros((1, 3)),
         (carry.R @ carry.speed)[None],
         carry.bias[None].copy(),
-        PreintegratedLinks.none(6 + len(window.imu)),
+        PreintegratedLinks.none(6 + len(window.imu) - 1),
         carry.camera.timeshift_s,
         Landmarks.none(),
-        gravity=window.gravity,
-        imu=window.imu,
+        window.imu,
         jumps=carry.jumps.copy(),
     )

@@ -18,7 +18,7 @@ class Order:
         F: Images.
         K: Knots.
         constants: Of camera and imu.
-        of_imu: The first so many of them are numbers of the imu (`imu_scale`), which move no pixel.
+        of_imu: The first so many of them are gravity and the numbers of the imu, which move no pixel.
         own: Errors of the window's own lens.
         jumps: Numbers of the clocks' jumps.
 
@@ -40,15 +40,19 @@ class Order:
         self.camera = np.concatenate([self.constants[of_imu:], self.own])
 
     def of_links(self, knots: IntArray) -> IntArray:
-        """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""
+        """Where the states of each link live: both images, knot, gravity, imu; shape (F - 1, 25 or more)."""
         entries = np.broadcast_to(self.imu, (len(knots), len(self.imu)))
         return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
 
 
 def link_errors(window: Window) -> tuple[FloatArray, FloatArray]:
-    """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 40)."""
+    """Whitened errors of the links about the present values, (F - 1, 9), and derivatives, see `of_links`."""
     w = window
-    return w.links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
+    e, J = w.links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
+    T = w.links.dt[:, None]
+    up = w.R[:-1, 2]  # in the frame of the imu; gravity points the other way
+    by_gravity = w.links.root @ np.concatenate([0.0 * up, T * up, 0.5 * T * T * up], axis=1)[..., None]
+    return e, np.concatenate([J[:, :, :24], by_gravity, J[:, :, 24:]], axis=2)
 
 
 def add_links(window: Window, sigmas: FloatArray, order: Order, H: FloatArray, g: FloatArray) -> float:
@@ -81,14 +85,12 @@ def add_links(window: Window, sigmas: FloatArray, order: Order, H: FloatArray, g
         for first in (0, 9):
             at = order.frames[own + first // 9].reshape(-1)
             _add_side(H, at, rows, A[own, first : first + 9, 18:24].reshape(-1, 6))
-        if len(order.imu):
-            _add_side(H, rows, order.imu, A[own, 18:24, 24:].sum(axis=0))
-    if len(order.imu):
-        H[order.imu[:, None], order.imu] += A[:, 24:, 24:].sum(axis=0)
-        g[order.imu] += b[:, 24:].sum(axis=0)
-        for first, frames in ((0, order.frames[:-1]), (9, order.frames[1:])):
-            side = A[:, first : first + 9, 24:].reshape(-1, len(order.imu))
-            _add_side(H, frames.reshape(-1), order.imu, side)
+        _add_side(H, rows, order.imu, A[own, 18:24, 24:].sum(axis=0))
+    H[order.imu[:, None], order.imu] += A[:, 24:, 24:].sum(axis=0)
+    g[order.imu] += b[:, 24:].sum(axis=0)
+    for first, frames in ((0, order.frames[:-1]), (9, order.frames[1:])):
+        side = A[:, first : first + 9, 24:].reshape(-1, len(order.imu))
+        _add_side(H, frames.reshape(-1), order.imu, side)
     cost = float((e**2).sum()) + _add_walk(window, order, H, g)
     if sigmas.any():
         off = ImageOffsets(window, e, J, sigmas)

@@ -39,7 +39,7 @@ class MarginalPrior:
         root: W with W^T W = information of the errors, shape (d, d).
         layout: Where the errors of one camera and the imu live, up to the jumps.
         t_cam_s: Stamp of that image, s.
-        imu: Errors of the imu, see `Window`.
+        imu: Gravity and errors of the imu, see `Window`.
         jumps: Step of the time shift, s, and change of its drift, s/s, at each of the last few boundaries
             between windows, shape (2 m,); their errors follow all others. See `clock_changes`.
         jump_t_s: Stamps of these boundaries, s.
@@ -93,8 +93,7 @@ def calibration_difference(window: Window, carry: MarginalPrior) -> FloatArray:
     """Errors of the constants that lead from what was carried in to the window's, shape (n,)."""
     layout = carry.layout
     d = camera_difference(window.camera, carry.camera, layout.camera, layout.size)
-    if layout.dynamic > CORE:
-        d[layout.inertial] = window.imu - carry.imu
+    d[layout.inertial] = window.imu - carry.imu
     return d
 
 

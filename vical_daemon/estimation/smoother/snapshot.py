@@ -57,7 +57,7 @@ class ReportedModels:
         d = d + step
         camera = moved_camera(self.carry.camera, layout.camera, d)
         if IMU not in self.asked:
-            gyro_matrix = matrices_of(self.carry.imu + d[layout.inertial])[0]
+            gyro_matrix = matrices_of((self.carry.imu + d[layout.inertial])[1:])[0]
             cameras, S = in_gyro_frame(layout, gyro_matrix, {name: camera}, S)
             camera = cameras[name]
         return camera, S
@@ -119,6 +119,6 @@ def camera_estimate(
 
 def imu_estimate(carry: MarginalPrior, *, matrices: bool = False, positions: bool = False) -> ImuEstimate:
     """Biases and their sigmas; if wanted, matrices and positions of the accelerometer's axes."""
-    sigma = np.sqrt(np.diag(carry.covariance())[BIASES])
-    positions_m = imu_scale.positions_m(carry.imu[imu_scale.APART]) if positions else None
-    return imu_snapshot(carry.bias, sigma, matrices_of(carry.imu) if matrices else (), positions_m)
+    sigma, numbers = np.sqrt(np.diag(carry.covariance())[BIASES]), carry.imu[1:]
+    positions_m = imu_scale.positions_m(numbers[imu_scale.APART]) if positions else None
+    return imu_snapshot(carry.bias, sigma, matrices_of(numbers) if matrices else (), positions_m)

@@ -158,7 +158,7 @@ class TargetFreeInitializer:
         camera = replace(
             _known(known).camera, R_imu_cam=found.camera.R_imu_cam, timeshift_s=found.camera.timeshift_s
         )
-        imu = np.concatenate([found.imu[:6], known.imu])
+        imu = np.concatenate([found.imu[:6], known.imu[1:]])
         return self._structure(buffer, frames, _Found(camera, imu, found.arm_sigma_m))
 
     def _structure(self, buffer: ImuBuffer, frames: Frames, found: _Found) -> Window | str:
@@ -270,7 +270,7 @@ def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
 
 
 def _known(known: MarginalPrior) -> _Found:
-    return _Found(deepcopy(known.camera), np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
+    return _Found(deepcopy(known.camera), np.concatenate([known.bias[:3], np.zeros(3), known.imu[1:]]), 5e-3)
 
 
 def _misfit(fit: EpipolarFit) -> float:

@@ -108,9 +108,11 @@ class TrackStart:
         self._motion = LinearMotion.along(self._R, links.dt, links.dR, links.dv, links.dp)
         zero = np.zeros((len(frames), 3))
         window = Window(
-            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, Landmarks.none()
+            *(camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift),
+            Landmarks.none(),
+            np.concatenate([[gravity_mps2], imu[6:]]),
         )
-        window.bias[:, :3], window.imu = imu[:3], imu[6:]
+        window.bias[:, :3] = imu[:3]
         window.fit_knots()
         window.measure_turning(buffer)
         self._seen = window.observe()
@@ -160,7 +162,6 @@ class TrackStart:
         window.v = np.cumsum(np.concatenate([z[None, SPEED], gained]), axis=0) @ world.T
         self.camera.p_imu_cam = z[ARM].copy()
         window.bias[:, 3:] = z[BIAS]
-        window.gravity = np.array([0.0, 0.0, -self._gravity_mps2])
         return window
 
     def _solve(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> _Linear | None:

@@ -89,9 +89,9 @@ class Window:
         links: Inertial constraints between neighbours.
         shift_s: Time shift for which instants and links hold; the camera's own differs from it by little.
         landmarks: What has been placed so far.
-        gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
-        imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
+        imu: Magnitude of gravity, m/s^2, and the numbers of `imu_scale` where they are estimated, shape (1,),
+            (17,) or (23,).
         own_lens: What fx fy cx cy and the distortion differ by in this window, see `LensMisfit`, shape (n,).
         jumps: See `MarginalPrior`.
         turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
@@ -107,9 +107,8 @@ class Window:
     links: PreintegratedLinks
     shift_s: float
     landmarks: Landmarks
-    gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
+    imu: FloatArray
     bad: set[tuple[int, int]] = field(default_factory=set)
-    imu: FloatArray = field(default_factory=lambda: np.zeros(0))
     own_lens: FloatArray = field(default_factory=lambda: np.zeros(0))
     jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
     turning: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 3)))
@@ -123,6 +122,16 @@ class Window:
         """Fx fy cx cy, distortion and model in this window."""
         camera, own = self.camera, self.own_lens
         return camera.intrinsics + own[:4], camera.distortion + own[4:], camera.distortion_model
+
+    @property
+    def gravity(self) -> FloatArray:
+        """Acceleration of free fall in the world, m/s^2, shape (3,)."""
+        return np.array([0.0, 0.0, -self.imu[0]])
+
+    @property
+    def gyro_matrix(self) -> FloatArray:
+        """M_g, shape (3, 3)."""
+        return matrices(self.imu[1:])[0]
 
     @property
     def span_s(self) -> float:
@@ -145,25 +154,25 @@ class Window:
     def rates(self) -> FloatArray:
         """Angular rate at each image, bias removed, rad/s, shape (F, 3)."""
         knots = self.knots()
-        rates = np.asarray(self.turning[0] - self.bias[np.concatenate([knots[:1], knots]), :3])
-        return rates @ matrices(self.imu)[0].T if len(self.imu) else rates
+        rates = self.turning[0] - self.bias[np.concatenate([knots[:1], knots]), :3]
+        return np.asarray(rates @ self.gyro_matrix.T)
 
     def imu_by_link(self) -> FloatArray:
-        """Bias in force on each link, and entries of the matrices, shape (F - 1, 6) or (F - 1, 21)."""
+        """Bias in force on each link, and numbers of the imu, shape (F - 1, 6 or 22 or 28)."""
         bias = self.bias[self.knots()]
-        return np.concatenate([bias, np.broadcast_to(self.imu, (len(bias), len(self.imu)))], axis=1)
+        return np.concatenate([bias, np.broadcast_to(self.imu[1:], (len(bias), len(self.imu) - 1))], axis=1)
 
     def accelerations(self) -> tuple[FloatArray, FloatArray]:
         """Angular (imu frame) and linear (world) acceleration at each image, shapes (F, 3)."""
         if len(self.frames) < 2:
             return np.zeros_like(self.v), np.zeros_like(self.v)
         t = np.array([s for s, _ in self.frames])
-        turning = self.turning[1] @ matrices(self.imu)[0].T if len(self.imu) else self.turning[1]
+        turning = self.turning[1] @ self.gyro_matrix.T
         return turning, np.gradient(self.v, t, axis=0)
 
     def extend(self, buffer: ImuBuffer, frames: Frames) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
-        imu = np.concatenate([self.bias[-1], self.imu])[None]
+        imu = np.concatenate([self.bias[-1], self.imu[1:]])[None]
         t_s = np.array([self.frames[-1][0], *(t for t, _ in frames)]) + self.shift_s
         count, links = len(frames), None
         while count:  # all but those that readings do not reach

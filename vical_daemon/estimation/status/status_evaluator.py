@@ -185,9 +185,13 @@ class StatusEvaluator(Evaluator):
             partial=f is not None and f.unobservable is not None,
             frames=self.frames,
             imu=None if shown is None else imu_estimate(shown, self._asked, axes_m),
-            gravity=[] if shown is None else shown.state.gravity.tolist(),
+            gravity=[] if shown is None else self._of_stated_size(shown.state.gravity),
             refused=self._points[0] / max(self._points[1], 1),
         )
+
+    def _of_stated_size(self, gravity: FloatArray) -> list[float]:
+        """Gravity with its direction alone estimated: scale of the accelerometer and its size look alike."""
+        return [self.options.gravity_mps2 / float(np.linalg.norm(gravity)) * float(x) for x in gravity]
 
     def _report_change(self, now: dict[str, CameraEstimate], t_s: float, *, doubt: bool) -> None:
         """Name what has changed as soon as that is known; once it is known well, report by how much.

@@ -144,7 +144,7 @@ def _target_moves(state: State, size: int) -> FloatArray:
     out[ATTITUDE, :3] = _TURN_RAD * state.R_world_imu.T
     out[POSITION, :3] = -_TURN_RAD * so3.hat(state.p_world_imu)
     out[VELOCITY, :3] = -_TURN_RAD * so3.hat(state.v_world_imu)
-    out[GRAVITY, :3] = _TURN_RAD * state.tilt.T
+    out[GRAVITY, :3] = -_TURN_RAD * so3.hat(state.gravity)
     out[POSITION, 3:] = _MOVE_M * np.eye(3)
     return out
 

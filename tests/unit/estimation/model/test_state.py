@@ -1,11 +1,10 @@
-"""Layout, attitude errors and gravity's tilt against scipy."""
+"""Layout, attitude errors against scipy, errors of gravity."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.model import state as st
-from vical_daemon.estimation.model.retract import retract
 
 
 def test_rotation_from_grp_is_scipys_rotation_from_mrp_and_back():
@@ -21,37 +20,38 @@ def test_small_errors_are_rotation_vectors():
     np.testing.assert_allclose(st.rotation_from_grp(p), Rotation.from_rotvec(p).as_matrix(), atol=1e-11)
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (0.1, -9.7, 1.2), (9.8, 0, 0), (0, 1e-9, -1)])
-def test_tilt_basis_is_orthonormal_and_across_gravity(direction):
-    g = 9.8 * np.array(direction, dtype=float) / np.linalg.norm(direction)
-    B = st.tilt_basis(g)
-    np.testing.assert_allclose(B.T @ B, np.eye(2), atol=1e-12)
-    np.testing.assert_allclose(g @ B, 0.0, atol=1e-12)
+GRAVITIES = [(0, 0, 9.8), (0, 0, -9.8), (0.1, -9.7, 1.2), (9.8, 0, 0), (0, 1e-9, -9.8)]
 
 
-def test_tilting_keeps_the_length_and_turns_by_the_angle():
+@pytest.mark.parametrize("gravity", GRAVITIES)
+def test_errors_along_gravity_change_its_length_and_those_across_turn_it(gravity):
+    g = np.array(gravity, dtype=float)
+    size = np.linalg.norm(g)
+    across = np.linalg.svd(g[None])[2][1:].T @ [0.2, -0.1]
+    d = np.array([0.0 * g, 0.015 * g / size, across, across - 0.03 * g / size])
+    moved = st.moved_gravity(g, d)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1) - size, [0.0, 0.015, 0.0, -0.03], atol=1e-12)
+    np.testing.assert_allclose(np.cross(moved[:2], g), 0.0, atol=1e-12)
+    angles = np.arctan2(np.linalg.norm(np.cross(moved[2:], g), axis=1), moved[2:] @ g)
+    np.testing.assert_allclose(angles, np.arctan(np.hypot(0.2, 0.1) / size))
+    assert np.all(moved[2:] @ across > 0)
+    np.testing.assert_allclose([st.gravity_difference(x, g) for x in moved], d, atol=1e-12)
+
+
+@pytest.mark.parametrize("gravity", GRAVITIES)
+def test_small_errors_of_gravity_are_added(gravity):
+    g, d = np.array(gravity, dtype=float), 1e-6 * np.eye(3)
+    np.testing.assert_allclose(st.moved_gravity(g, d) - g, d, atol=1e-12)
+
+
+def test_the_root_of_gravity_has_the_sigmas_of_direction_and_size():
     g = np.array([1.0, -9.0, 3.0])
-    tilted = st.tilted_gravity(g, st.tilt_basis(g), np.array([[0.0, 0.0], [0.02, -0.01]]))
-    np.testing.assert_allclose(tilted[0], g)
-    assert np.linalg.norm(tilted[1]) == pytest.approx(np.linalg.norm(g), rel=1e-14)
-    angle = np.arccos(tilted[1] @ g / (g @ g))
-    assert angle == pytest.approx(np.hypot(0.02, 0.01), rel=1e-4)
-
-
-@pytest.mark.parametrize("direction", [(0.0, 1.0, 1e-4), (1.0, 0.0, 1e-4), (0.6, -0.8, 1e-4)])
-def test_the_directions_of_tilt_turn_with_gravity_and_never_jump(direction):
-    layout = st.make_layout({}, fix=frozenset(), estimate=frozenset())
-    z, eye = np.zeros(3), np.eye(3)
-    state = st.State(0.0, eye, z, z, z, z, 9.8 * np.array(direction), {})
-    first = state.tilt
-    for step in np.linspace(-1e-3, 1e-3, 11):  # back and forth through the horizontal
-        dx = np.zeros(layout.size)
-        dx[st.GRAVITY] = first.T @ np.cross(state.gravity / 9.8, [0.0, 0.0, step])
-        state = retract(state, layout, dx)
-        np.testing.assert_allclose(state.tilt.T @ state.tilt, np.eye(2), atol=1e-12)
-        np.testing.assert_allclose(state.gravity @ state.tilt, 0.0, atol=1e-12)
-        np.testing.assert_allclose(state.tilt, first, atol=5e-3)
-    assert state.gravity[2] * direction[2] < 0 or abs(state.gravity[2]) < 0.02
+    P = (lambda S: S @ S.T)(st.gravity_root(g, 0.1, 0.015))
+    size = np.linalg.norm(g)
+    assert g @ P @ g / size**2 == pytest.approx(0.015**2)
+    for across in np.linalg.svd(g[None])[2][1:]:
+        assert across @ P @ across == pytest.approx((0.1 * size) ** 2)
+        assert across @ P @ g == pytest.approx(0.0, abs=1e-12)
 
 
 def test_layout_has_no_overlap_and_covers_everything():
@@ -61,7 +61,7 @@ def test_layout_has_no_overlap_and_covers_everything():
         estimate=frozenset({"imu_intrinsics", "size_effect", "accel_lag", "readout", "target_scale"}),
     )
     used = np.zeros(layout.size, dtype=int)
-    used[:17] += 1
+    used[: st.CORE] += 1
     used[layout.gyro_matrix] += 1
     used[layout.accel_matrix] += 1
     used[layout.accel_positions] += 1
@@ -73,7 +73,7 @@ def test_layout_has_no_overlap_and_covers_everything():
             used[i] += 1
     used[layout.target_scale] += 1
     assert (used == 1).all()
-    assert layout.dynamic == 39
+    assert layout.dynamic == 40
 
 
 def test_fixed_blocks_are_not_in_the_layout():
@@ -81,5 +81,5 @@ def test_fixed_blocks_are_not_in_the_layout():
         {"a": "radtan"}, fix=frozenset({"intrinsics", "timeshift", "extrinsics"}), estimate=frozenset()
     )
     c = layout.cameras["a"]
-    assert layout.size == 17
+    assert layout.size == st.CORE
     assert (c.position, c.rotation, c.timeshift, c.skew, c.intrinsics, c.distortion) == (None,) * 6

@@ -99,8 +99,8 @@ def test_nothing_learnt_is_no_evidence_however_long_errors_last():
     f, *_ = some_filter(factor=9.0)
     f.S = np.diag(np.full(f.layout.size, 1e-2))
     for where, sigma in (
-        (slice(17, 32), ENTRY_SIGMA),
-        (slice(32, 33), LAG_SIGMA_S),
+        (slice(f.layout.gyro_matrix.start, f.layout.accel_matrix.stop), ENTRY_SIGMA),
+        (slice(f.layout.accel_lag, f.layout.accel_lag + 1), LAG_SIGMA_S),
         (slice(f.layout.target_scale, f.layout.target_scale + 1), SIZE_SIGMA),
         (f.layout.target_shape, f.layout.target_modes.sigma_m),
     ):

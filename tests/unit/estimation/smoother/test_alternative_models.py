@@ -18,15 +18,15 @@ from vical_daemon.estimation.smoother.snapshot import camera_estimate
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
 LAYOUT = window_layout()
 N = LAYOUT.size - CORE
-NUMBERS = np.arange(16)  # of the imu, the first of the constants
+NUMBERS = 1 + np.arange(16)  # of the imu; the first of the constants is gravity
 STATED = {"both": NUMBERS, "imu": NUMBERS[:15], "lag": NUMBERS[15:], "none": NUMBERS[:0]}
-POSE, SHIFT = slice(16, 22), 22
+POSE, SHIFT = slice(17, 23), 23
 
 
 def carry(seed, off):
     """A calibration in which what is known of the imu hangs together with all the rest."""
     rng = np.random.default_rng(seed)
-    size = np.array([*PRIOR] + [1e-3] * 6 + [1e-4, 1e-5] + [1.0] * 4 + [1e-3] * 4 + [1e-4])
+    size = np.array([0.015, *PRIOR] + [1e-3] * 6 + [1e-4, 1e-5] + [1.0] * 4 + [1e-3] * 4 + [1e-4])
     half = rng.standard_normal((N, N + 4)) / np.sqrt(N)
     P = half @ half.T * np.outer(size, size) * 0.3
     whole = np.eye(CORE + N)
@@ -41,6 +41,7 @@ def carry(seed, off):
         "radtan",
         (640, 480),
     )
+    imu = np.concatenate([[9.8], imu])
     return MarginalPrior(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), LAYOUT, 0.0, imu), P
 
 
@@ -60,7 +61,7 @@ def mixture(P, x):
     odds, parts = {}, {}
     for name, at in STATED.items():
         k = {"both": 2, "imu": 1, "lag": 1, "none": 0}[name]
-        sigma = PRIOR[at]
+        sigma = PRIOR[at - 1]
         posterior = multivariate_normal.pdf(np.zeros(len(at)), x[at], P[np.ix_(at, at)]) if k else 1.0
         prior = multivariate_normal.pdf(np.zeros(len(at)), None, np.diag(sigma**2)) if k else 1.0
         odds[name] = 0.95**k * 0.05 ** (2 - k) * posterior / prior
@@ -76,7 +77,7 @@ def mixture(P, x):
 def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     known, P = carry(seed, off)
     x = np.zeros(N)
-    x[NUMBERS] = known.imu
+    x[NUMBERS] = known.imu[1:]
     models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=True)
     models.drifting = True
     reported = camera_estimate(

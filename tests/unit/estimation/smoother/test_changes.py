@@ -14,7 +14,6 @@ from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
-from vical_daemon.estimation.smoother.marginal_prior import CORE
 
 DISTURBANCES = {
     EventKind.IMU_GAP,
@@ -147,7 +146,7 @@ def spd(rng, n):
 
 def answers(rng, moved, layout=LAYOUT):
     """A prior over x (as `moved`) and the rest r, a true rig, and what a window says that knows r before."""
-    n, k = layout.size - CORE, len(moved)
+    n, k = layout.size - layout.dynamic, len(moved)
     known = spd(rng, n)
     true = np.linalg.cholesky(known) @ rng.standard_normal(n)
     true[:k] += moved
@@ -156,9 +155,9 @@ def answers(rng, moved, layout=LAYOUT):
     information = H.T @ H
     information[k:, k:] += np.linalg.inv(known[k:, k:])
     P = np.linalg.inv(information)
-    found = np.concatenate([np.zeros(CORE), P @ H.T @ y])
+    found = np.concatenate([np.zeros(layout.dynamic), P @ H.T @ y])
     covariance, prior = np.eye(layout.size), np.eye(layout.size)
-    covariance[CORE:, CORE:], prior[CORE:, CORE:] = P, known
+    covariance[layout.dynamic :, layout.dynamic :], prior[layout.dynamic :, layout.dynamic :] = P, known
     return found, covariance, prior
 
 

@@ -26,10 +26,11 @@ from vical_daemon.estimation.smoother.clock_changes import (
     settled,
     what_happened,
 )
-from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, root_of
 
 WINDOW_S, NOISE_S = 3.0, 60e-6
 LAYOUT = window_layout(fix=("extrinsics", "intrinsics"), estimate=())
+AT = LAYOUT.camera.timeshift
 CAMERA = CameraState(
     p_imu_cam=np.zeros(3),
     R_imu_cam=np.eye(3),
@@ -42,16 +43,16 @@ CAMERA = CameraState(
 
 
 def started():
-    P = np.diag([1.0] * CORE + [1e-6, SKEW_SIGMA**2])
+    P = np.diag([1.0] * AT + [1e-6, SKEW_SIGMA**2])
     motion = np.eye(3), np.zeros(3), np.zeros(6)
-    return MarginalPrior(*motion, CAMERA, root_of(P), LAYOUT, 0.0, np.zeros(0))
+    return MarginalPrior(*motion, CAMERA, root_of(P), LAYOUT, 0.0, np.array([9.8]))
 
 
 def after_window(carry, shift_s, rng, noise_s=NOISE_S):
     """What is known after a window that measured the time shift six times; `shift_s`: the truth, by time."""
     P, at = carry.covariance(), (np.arange(6) + 0.5) * WINDOW_S / 6
     H = np.zeros((6, len(P)))
-    H[:, CORE], H[:, CORE + 1] = 1.0, at
+    H[:, AT], H[:, AT + 1] = 1.0, at
     known = carry.camera.timeshift_s + carry.camera.skew * at
     R = 6.0 * noise_s**2 * np.eye(6)
     y = shift_s(carry.t_cam_s + at) + np.sqrt(6.0) * noise_s * rng.standard_normal(6) - known
@@ -59,10 +60,10 @@ def after_window(carry, shift_s, rng, noise_s=NOISE_S):
     dx, P = K @ y, P - K @ H @ P
     camera = replace(
         carry.camera,
-        timeshift_s=carry.camera.timeshift_s + dx[CORE],
-        skew=carry.camera.skew + dx[CORE + 1],
+        timeshift_s=carry.camera.timeshift_s + dx[AT],
+        skew=carry.camera.skew + dx[AT + 1],
     )
-    found = replace(carry, camera=camera, root=root_of(P), jumps=carry.jumps + dx[CORE + 2 :])
+    found = replace(carry, camera=camera, root=root_of(P), jumps=carry.jumps + dx[AT + 2 :])
     return found.at(carry.t_cam_s + WINDOW_S)
 
 
@@ -74,8 +75,8 @@ def followed(shift_s, windows, seed):
         carry = after_window(carry, shift_s, rng)
         events += [(carry.t_cam_s, e) for e in models.watch(carry, 1.0, compared=False)]
         d, P = over_clocks(carry, models.clocks(carry, 1.0))
-        error = carry.camera.timeshift_s + d[CORE] - shift_s(carry.t_cam_s)
-        z.append(float(error / np.sqrt(P[CORE, CORE])))
+        error = carry.camera.timeshift_s + d[AT] - shift_s(carry.t_cam_s)
+        z.append(float(error / np.sqrt(P[AT, AT])))
         carry, more = models.window_done(carry, 1.0)
         events += [(carry.t_cam_s, e) for e in more]
         carry = opened(carry)
@@ -92,9 +93,9 @@ def three_windows(seed=3):
 def unknowns(carry):
     """[drift before all jumps, jumps]: by the errors of the carry, and values."""
     rows = np.zeros((7, len(carry.root)))
-    rows[0, CORE + 1] = 1.0
-    rows[0, [CORE + 3, CORE + 5, CORE + 7]] = -1.0
-    rows[1:, CORE + 2 :] = np.eye(6)
+    rows[0, AT + 1] = 1.0
+    rows[0, [AT + 3, AT + 5, AT + 7]] = -1.0
+    rows[1:, AT + 2 :] = np.eye(6)
     return rows, np.concatenate([[carry.camera.skew - carry.jumps[1::2].sum()], carry.jumps])
 
 
@@ -108,11 +109,11 @@ def zero_rows(free):
 def test_a_jump_adds_its_variance_and_changes_nothing_else():
     carry = started()
     before, after = carry.covariance(), opened(carry).covariance()
-    n = CORE + 2
+    n = AT + 2
     added = after[:n, :n] - before
     assert np.diag(added)[-2:] == pytest.approx([STEP_SIGMA_S**2, SKEW_SIGMA**2])
     assert after[n:, n:] == pytest.approx(np.diag([STEP_SIGMA_S**2, SKEW_SIGMA**2]))
-    assert added[:CORE] == pytest.approx(np.zeros((CORE, n)), abs=1e-12)
+    assert added[:AT] == pytest.approx(np.zeros((AT, n)), abs=1e-12)
     # without the jump it is what it was
     dx, P = mixed(opened(carry), [(1.0, [(0,)])])
     assert dx == pytest.approx(np.zeros(n + 2), abs=1e-15)

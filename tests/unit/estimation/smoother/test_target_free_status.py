@@ -14,7 +14,9 @@ from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior,
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
 LAYOUT = window_layout()
-SIGMA = np.array([1e-3] * 16 + [1e-2] * 3 + [1e-3] * 3 + [1e-4, 1e-5] + [2.0] * 4 + [1e-3] * 4 + [1e-4])
+SIGMA = np.array(
+    [0.015] + [1e-3] * 16 + [1e-2] * 3 + [1e-3] * 3 + [1e-4, 1e-5] + [2.0] * 4 + [1e-3] * 4 + [1e-4]
+)
 CAMERA = CameraState(
     np.eye(3), np.zeros(3), 0.01, np.array([500.0, 500.0, 320.0, 240.0]), np.zeros(4), "radtan", (640, 480)
 )
@@ -24,7 +26,7 @@ def carry(shrunk=1.0):
     whole = np.eye(LAYOUT.size)
     whole[CORE:, CORE:] = shrunk * np.diag(SIGMA**2)
     return MarginalPrior(
-        np.eye(3), np.zeros(3), np.zeros(6), CAMERA, root_of(whole), LAYOUT, 0.0, np.zeros(16)
+        np.eye(3), np.zeros(3), np.zeros(6), CAMERA, root_of(whole), LAYOUT, 0.0, np.zeros(17)
     )
 
 
