@@ -40,6 +40,7 @@ class EventKind(StrEnum):
     IMAGE_GAP = "image_gap"
     IMAGE_REPEATED = "image_repeated"
     IMAGES_WANDER = "images_wander"
+    TIMESHIFT_VARIES = "timeshift_varies"
     IMU_NOISE = "imu_noise"
     IMU_INTRINSICS = "imu_intrinsics"
     ACCEL_LAG = "accel_lag"

@@ -379,6 +379,8 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     "on an even grid from now on; the calibration starts over",
     EventKind.IMAGES_WANDER: "whole images move by {:.1f px} against the motion of the IMU: switch off "
     "image stabilisation; lens, camera and board must not move on their own",
+    EventKind.TIMESHIFT_VARIES: "the time shift varies by {:.1f ms} within seconds: hold the exposure, or "
+    "stamp the middle of exposures",
     EventKind.STAMPS_STEPPED: "its stamps stepped by about {:+.1f s} against those of the IMU",
     EventKind.IMU_CLOCK_SET_BACK: "the IMU's stamps went back by {:.1f s}: its clock was set",
     EventKind.IMU_CLOCK_REMAPPED: "the IMU's stamps moved by {:+.1f ms}: its driver mapped the clock again; "

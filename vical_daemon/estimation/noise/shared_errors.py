@@ -27,6 +27,7 @@ _EVERY = 20  # images that are added together; nothing is said before, unless a 
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
 _WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
+_WANDERS_S = 5e-4  # three times what they show there; an exposure that varies moves the time shift by ms
 WAYS = 3  # late, to the side, down
 
 
@@ -40,6 +41,7 @@ class SharedErrors:
         jitter_found_s: The jitter where there surely is one, s; else 0.
         wander_px: The shift where it is large and that of neighbours alike (image stabilisation, a loose
             lens, a board that moves); else 0.
+        wander_s: Likewise of the delays of the images (an exposure that adapts to the light).
         images: Images taken in.
         until_s: Stamp (s) up to which images are known from the start, and are not to count again; -inf once
             they have passed.
@@ -49,6 +51,7 @@ class SharedErrors:
     shift_px: float = 0.0
     jitter_found_s: float = 0.0
     wander_px: float = 0.0
+    wander_s: float = 0.0
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
@@ -109,8 +112,10 @@ class SharedErrors:
     def _look(self) -> None:
         known = posterior(self._likelihood, JITTERS_S, SHIFTS_PX)
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
-        surely = 1.0 - known.absent[0] > SURE and self._alike(0, self.jitter_s) < PERSISTENT
-        self.jitter_found_s = self.jitter_s if surely else 0.0
+        surely, alike = 1.0 - known.absent[0] > SURE, self._alike(0, self.jitter_s)
+        self.jitter_found_s = self.jitter_s if surely and alike < PERSISTENT else 0.0
+        varies = surely and self.jitter_s > _WANDERS_S and PERSISTENT < alike < math.inf
+        self.wander_s = self.jitter_s if varies else 0.0
         wanders = self.shift_px > _WANDERS_PX and PERSISTENT < self._alike(1, self.shift_px) < math.inf
         self.wander_px = self.shift_px if wanders else 0.0
 

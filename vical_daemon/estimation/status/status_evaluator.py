@@ -38,6 +38,7 @@ from vical_daemon.estimation.status.mounting_changes import (
 from vical_daemon.estimation.wording import not_in_view
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
+SHIFT_VARIES = "the time shift varies within seconds: hold the exposure, or stamp the middle of exposures"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
@@ -150,6 +151,9 @@ class StatusEvaluator(Evaluator):
         if shared.wander_px:
             event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
             self.announce(event, once=f"wander {report.camera}")
+        if shared.wander_s:
+            event = Event(EventKind.TIMESHIFT_VARIES, report.camera, shared.wander_s)
+            self.announce(event, once=f"varies {report.camera}")
 
     # ------------------------------------------------------------------ output
     def estimate(
@@ -231,6 +235,8 @@ class StatusEvaluator(Evaluator):
             return clock_drift.CLOCKS_IN_DOUBT
         if any(x.wander_px for x in f.shared.values()):
             return IMAGES_WANDER
+        if any(x.wander_s for x in f.shared.values()):
+            return SHIFT_VARIES
         return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=self.believed), "")
 
     def weighed(self, f: CalibrationFilter, shares: model_mixture.Weights | None = None) -> CalibrationFilter:

@@ -144,6 +144,7 @@ _ACTIONABLE = {
     EventKind.LENS_TERM_MISSING,
     EventKind.STAMP_JITTER,
     EventKind.IMAGES_WANDER,
+    EventKind.TIMESHIFT_VARIES,
     EventKind.IMU_NOISE,
     EventKind.IMU_CLIPPED,
     EventKind.ACCEL_LAG,

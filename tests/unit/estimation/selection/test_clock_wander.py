@@ -34,6 +34,24 @@ def test_an_exposure_that_adapts_to_the_light(seed: int) -> None:
     assert np.sqrt(np.mean(np.square(shown))) < 2.0 and max(shown) < 4.0  # 6.1 to 7.0 and 15 without
 
 
+@pytest.mark.parametrize("seed", [41, 42])
+def test_an_exposure_that_changes_too_fast_to_be_followed_is_named_and_does_not_converge(seed: int) -> None:
+    """Up and down by 3 ms every 2 s; without being named, seconds of `converged` beyond 5 sigma."""
+    run = simulate(seed, 20.0, camera_rate_hz=10.0)
+
+    def late_s(t_s: float) -> float:
+        return 3e-3 * float(np.sign(np.sin(2.0 * np.pi * t_s / 4.3)))
+
+    late = [replace(f, t_cam_ns=f.t_cam_ns + round(1e9 * late_s(f.t_s))) for f in run.frames]
+    prior = camera_prior(run, seed, StartErrors(), exact_lens=True)
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=imu_noise(run))
+    record = feed(replace(run, frames=late), CalibratorSubject(options, prior, run.points_m))
+    named = [(t_s, e) for t_s, e in record.events if e.kind is EventKind.TIMESHIFT_VARIES]
+    ((t_s, event),) = named
+    assert event.value == pytest.approx(3e-3, rel=0.5)
+    assert all(s.status != "converged" for s in record.snapshots if s.t_s > t_s + 2.0)
+
+
 def test_what_a_walk_explains_is_no_other_drift() -> None:
     rng = np.random.default_rng(1)
     values = np.cumsum(rng.standard_normal(200))
