@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from vical_drivers.host_clocks import HostClocks
 
 from vical_mocks.v4l2_camera import Bytes, FakeCamera, FrameTruth
 from vical_mocks.v4l2_requests import (
@@ -59,6 +60,7 @@ class FakeKernel(Requests):
         super().__init__(clock or VirtualClock())
         self.mappings: set[int] = set()
         self.requests: deque[int] = deque(maxlen=10_000)
+        self.suspended_ns = 0
         self._open: dict[int, OpenNode] = {}
         self._next_fd = _FIRST_FD
         (self.dev / "v4l/by-id").mkdir(parents=True)
@@ -121,9 +123,10 @@ class FakeKernel(Requests):
         """CLOCK_MONOTONIC."""
         return self.clock.now_ns
 
-    def clocks_ns(self) -> tuple[int, int]:
-        """CLOCK_MONOTONIC, and CLOCK_REALTIME: another epoch."""
-        return self.clock.now_ns, self.clock.now_ns + 1_700_000_000_000_000_000
+    def clocks(self) -> HostClocks:
+        """The wall clock has another epoch; CLOCK_BOOTTIME is ahead by `suspended_ns`."""
+        now_ns = self.clock.now_ns
+        return HostClocks(now_ns, now_ns + 1_700_000_000_000_000_000, now_ns + self.suspended_ns)
 
     def open(self, path: str) -> int:
         """Open a node."""

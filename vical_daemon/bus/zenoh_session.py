@@ -36,6 +36,12 @@ stays below the usual limit of 8 MiB of other programs. Images that do not fit a
 _ENOUGH_LOCKED_BYTES = 64 * 2**20
 """Limit of locked memory from which memory is shared, bytes: ten routers' pools with their bookkeeping
 (5.4 MiB each, measured: tests/system/test_shared_memory.py)."""
+_WANTED_FILES = 1024
+"""Open files that a process asks for, as far as its hard limit goes: `select`, which pyserial uses, takes no
+more (FD_SETSIZE of select.h)."""
+_LEAST_FILES = 64
+"""Open files without which no session is opened: zenoh ends a process that cannot open one more (a panic).
+The router of an emulated rig with three clients has 43 open, and two more for each further one (measured)."""
 _CAP_IPC_LOCK = 14
 """Number of the capability in linux/capability.h."""
 _LOCKED = (
@@ -182,7 +188,12 @@ def free_socket(path: Path) -> None:
 
 
 def open_session(config: dict[str, Any]) -> Any:
-    """Open a session, without shared memory if the process may lock too little."""
+    """Open a session, without shared memory if the process may lock too little.
+
+    Raises:
+        BusError: No router, or too few files that the process may open.
+    """
+    _allow_files()
     shared = config["transport"]["shared_memory"]["enabled"]
     if not shared:
         _warn_of_copies(_LOCKED)
@@ -198,6 +209,23 @@ def open_session(config: dict[str, Any]) -> Any:
         return _open(config)
     except zenoh.ZError as error:
         raise BusError(_explain(config, str(error))) from None
+
+
+def _allow_files() -> None:
+    """Raise the limit of open files as far as a session may need.
+
+    Raises:
+        BusError: The hard limit is too low.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if 0 <= soft < _WANTED_FILES:  # RLIM_INFINITY is -1
+        soft = _WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, _WANTED_FILES)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    if 0 <= soft < _LEAST_FILES:
+        raise BusError(
+            f"this process may open {soft} files, the bus needs {_LEAST_FILES}: raise the limit "
+            f"(ulimit -n {_WANTED_FILES}, or LimitNOFILE={_WANTED_FILES} in a unit)"
+        )
 
 
 def _open(config: dict[str, Any]) -> Any:

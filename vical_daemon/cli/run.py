@@ -136,7 +136,10 @@ def _attend(
     bus.subscribe(key, lambda sample: liveness.take(sample, time.monotonic()))
     ready, said = False, False
     while not stop.is_set() and not threads.failed.is_set():
+        turn_s = time.monotonic()
         stop.wait(_TICK_S)
+        if time.monotonic() - turn_s > 2.0 * _TICK_S:  # all were held up: let the roles report first
+            stop.wait(_TICK_S)
         if not ready and liveness.ready():
             ready = True
             gc.collect()

@@ -124,8 +124,13 @@ class StatusSender:
             statuses: Makes what is published.
             openings: How often devices were opened. A change is published at once, as the device may be new.
         """
-        opened = 0
+        opened, turn_s = 0, time.monotonic()
         while not stop.is_set():
+            if time.monotonic() - turn_s > STATUS_PERIOD_S:
+                # The whole process was held up (SIGSTOP, a paused virtual machine): the device threads, which
+                # may have had no turn yet, are not stuck.
+                stop.wait(STATUS_PERIOD_S / 2)
+            turn_s = time.monotonic()
             before, opened = opened, openings()
             self.tick(statuses, force=opened != before)
             stop.wait(STATUS_PERIOD_S / 10)

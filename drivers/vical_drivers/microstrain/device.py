@@ -166,7 +166,10 @@ class MicrostrainImu(Closing):
             return []
         try:
             raw = self._session.read(timeout_s)
-            self._watch_silence(heard=bool(raw), timeout_s=timeout_s)
+            if raw:
+                self._silent_s, self._last_read_s = 0.0, time.monotonic()
+            else:
+                self._watch_silence(timeout_s)
         except DriverError:
             self._drop()
             raise
@@ -183,11 +186,10 @@ class MicrostrainImu(Closing):
             return []
         return samples
 
-    def _watch_silence(self, *, heard: bool, timeout_s: float) -> None:
+    def _watch_silence(self, timeout_s: float) -> None:
         """Add up the time in which the host listened and nothing came."""
         now_s = time.monotonic()
-        listened_s = min(now_s - self._last_read_s, timeout_s + _ABSENT_S)
-        self._silent_s = 0.0 if heard else self._silent_s + listened_s
+        self._silent_s += min(now_s - self._last_read_s, timeout_s + _ABSENT_S)
         self._last_read_s = now_s
         if self._silent_s > self._options.silence_s:
             raise DeviceTimeoutError(f"{self._path}: the stream went silent; check power and cable")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -37,3 +38,11 @@ def test_an_interruption_between_the_readings_is_not_taken_for_an_offset(
     monotonic_ns, realtime_ns = host_clocks.read_host_clocks()
     assert monotonic_ns == 5_000_000_200  # the time of the call, however long it took
     assert abs(realtime_ns - EPOCH_NS - monotonic_ns) <= error_ns
+
+
+def test_all_clocks_are_those_of_this_computer() -> None:
+    before_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    clocks = host_clocks.read_all_clocks()
+    after_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    assert before_ns - 100_000 <= clocks.boottime_ns <= after_ns + 100_000
+    assert abs(clocks.realtime_ns - time.time_ns()) < 1e9

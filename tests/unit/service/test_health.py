@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import pytest
@@ -59,3 +60,37 @@ def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.Monkey
         "clock_set: the system clock was set back: it agrees with vical's stamps again",
         f"clock_set: the system clock was set: it is 1.0 s behind vical's stamps, {tail}",
     ]
+
+
+def test_threads_of_a_process_that_was_stopped_are_not_called_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After SIGCONT, or a pause of the virtual machine, the status comes after the devices' next turn."""
+
+    class Computer(threading.Event):
+        """Its clock runs while somebody waits; in its 30th wait the whole process is stopped for 20 s."""
+
+        now_s, turned_s, waits = 100.0, 100.0, 0
+
+        def monotonic(self) -> float:
+            return self.now_s
+
+        def wait(self, timeout: float | None = None) -> bool:
+            self.now_s += timeout or 0.0
+            self.waits += 1
+            if self.waits == 30:
+                self.now_s += 20.0
+            else:
+                self.turned_s = self.now_s  # a device loop turns within 0.2 s
+            if self.waits == 60:
+                self.set()
+            return self.is_set()
+
+    computer, ages_s = Computer(), list[float]()
+
+    def statuses() -> list[DiagnosticStatus]:
+        ages_s.append(computer.now_s - computer.turned_s)
+        return []
+
+    monkeypatch.setattr(health, "time", computer)
+    health.StatusSender("rig0", "imu", LocalBus(), WallClock(0)).run_until(computer, statuses)
+    assert len(ages_s) >= 5
+    assert max(ages_s) < 1.0

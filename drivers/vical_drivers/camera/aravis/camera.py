@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vical_drivers.camera.aravis.dating import CameraClock
 from vical_drivers.camera.aravis.process import OPEN_TIMEOUT_S, GrabberProcess
 from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
 from vical_drivers.camera.frame_maker import FrameMaker
@@ -21,7 +22,6 @@ from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import SIGMA_NS, Anchor, RawStamp
 from vical_drivers.closing import Closing
-from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (
     DeviceLostError,
     DeviceRefusedError,
@@ -32,7 +32,6 @@ from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 _log = logging.getLogger(__name__)
 
-_MIN_AGE_S = 1.0
 _FORMATS: dict[str, PixelFormat] = {
     "Mono8": FORMATS["GREY"],
     "Mono10": FORMATS["Y10"],
@@ -89,9 +88,7 @@ class AravisCamera(Closing):
         self._frames.stamper.set_exposure(_ns(answer[0]["exposure_s"]), 0)
         self._counter = SequenceCounter(16, skips_zero=True)
         self._sequence = 0
-        self._envelope = LowerEnvelope()
-        self._first: tuple[int, int] | None = None
-        self._device_ns = 0
+        self._clock = CameraClock(self._info.details["uri"])
 
     def _describe(self, opened: dict[str, Any]) -> DeviceInfo:
         device = opened["device"]
@@ -179,7 +176,7 @@ class AravisCamera(Closing):
         fields, data = message
         if fields["kind"] == "exposure":
             self._frames.stamper.set_exposure(_ns(fields["exposure_s"]), fields["t_ns"])
-            self._first = None  # the way from the camera's stamp to its first packet is another now
+            self._clock.forget()  # the way from the camera's stamp to its first packet is another now
             return None
         missing = self._counter.missing_before(fields["frame_id"])
         self._sequence += missing + 1
@@ -202,27 +199,19 @@ class AravisCamera(Closing):
         return self._frames.frame(image, raw, sequence=self._sequence, t_arrival_ns=fields["arrival_ns"])
 
     def _raw_stamp(self, device_ns: int, first_packet_ns: int) -> RawStamp:
-        packet = RawStamp(first_packet_ns, Anchor.FIRST_PACKET, None, SIGMA_NS[Anchor.FIRST_PACKET])
-        if device_ns <= self._device_ns:  # no clock, or it was set anew
-            self._first = None
-        self._device_ns = device_ns
-        if device_ns <= 0:
-            return packet
-        if self._first is None:
-            self._first, self._envelope = (device_ns, first_packet_ns), LowerEnvelope()
-        x_s = (device_ns - self._first[0]) * 1e-9
-        self._envelope.add(x_s, (first_packet_ns - self._first[1]) * 1e-9 - x_s)
-        if x_s < _MIN_AGE_S:
-            return packet
+        before = self._clock.settings
+        dated = self._clock.date(device_ns, first_packet_ns)
+        if self._clock.settings != before:
+            self._frames.statistics.count("clock_restarts")
+        if dated is None:
+            return RawStamp(first_packet_ns, Anchor.FIRST_PACKET, None, SIGMA_NS[Anchor.FIRST_PACKET])
         forced = self._settings.stamp
         anchor = Anchor.FIRST_PACKET if forced in ("auto", "raw") else Anchor(forced)
-        t_ns = self._first[1] + round((x_s + self._envelope.line(x_s)) * 1e9)
-        sigma_ns = round(self._envelope.sigma_s * 1e9)
-        return RawStamp(t_ns, anchor, f"{anchor.value}(device-clock)", sigma_ns)
+        return RawStamp(dated[0], anchor, f"{anchor.value}(device-clock)", dated[1])
 
     def stats(self) -> SourceStats:
         """Counters since the source was opened."""
-        return self._frames.statistics.snapshot(clock_skew_ppm=-self._envelope.skew * 1e6)
+        return self._frames.statistics.snapshot(clock_skew_ppm=-self._clock.skew * 1e6)
 
     def close(self) -> None:
         """Stop the camera and end its process; may be called twice."""

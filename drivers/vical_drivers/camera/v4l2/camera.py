@@ -35,6 +35,7 @@ from vical_drivers.camera.v4l2.node import DequeuedBuffer
 from vical_drivers.camera.v4l2.session import V4l2Session
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceLostError, DriverError
+from vical_drivers.host_clocks import HostClocks
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 _log = logging.getLogger(__name__)
@@ -227,10 +228,11 @@ class V4l2Camera(Closing):
         self._frames.stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
-        # before anything takes time: a stamp of the wall clock is moved by the pair
-        t_arrival_ns, t_realtime_ns = self._kernel.clocks_ns()
+        # before anything takes time: a stamp of another clock is moved by their difference
+        now = self._kernel.clocks()
+        t_arrival_ns = now.monotonic_ns
         before_ns = session.stamped_ns
-        known_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns, before_ns)
+        known_ns = to_monotonic_ns(buffer.t_ns, now, before_ns)
         if known_ns is not None:
             session.stamped_ns = known_ns
         t_stamp_ns = known_ns or t_arrival_ns
@@ -246,7 +248,7 @@ class V4l2Camera(Closing):
             if not image.flags.owndata:
                 image = image.copy()
             session.node.queue(buffer.index)
-        raw = self._raw_stamp(session, buffer, t_arrival_ns, t_realtime_ns, before_ns)
+        raw = self._raw_stamp(session, buffer, now, before_ns)
         frame = self._frames.frame(image, raw, sequence=buffer.sequence, t_arrival_ns=t_arrival_ns)
         self._say_rule(frame.stamp_rule)
         return frame
@@ -267,12 +269,7 @@ class V4l2Camera(Closing):
             return None
 
     def _raw_stamp(
-        self,
-        session: V4l2Session,
-        buffer: DequeuedBuffer,
-        t_arrival_ns: int,
-        t_realtime_ns: int,
-        before_ns: int | None,
+        self, session: V4l2Session, buffer: DequeuedBuffer, now: HostClocks, before_ns: int | None
     ) -> RawStamp:
         if session.metadata is not None:
             fitted = session.metadata.stamp(buffer)
@@ -281,8 +278,7 @@ class V4l2Camera(Closing):
         return kernel_stamp(
             buffer,
             driver=session.identity.driver,
-            monotonic_ns=t_arrival_ns,
-            realtime_ns=t_realtime_ns,
+            now=now,
             forced=self._settings.stamp,
             uvc_hwtimestamps=session.uvc_hwtimestamps,
             before_ns=before_ns,

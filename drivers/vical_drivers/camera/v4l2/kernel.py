@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from vical_drivers.host_clocks import read_host_clocks
+from vical_drivers.host_clocks import HostClocks, read_all_clocks
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.mmap.restype = ctypes.c_void_p
@@ -76,8 +76,8 @@ class Kernel(Protocol):
         """CLOCK_MONOTONIC, ns."""
         ...
 
-    def clocks_ns(self) -> tuple[int, int]:
-        """CLOCK_MONOTONIC and CLOCK_REALTIME of the same moment, ns."""
+    def clocks(self) -> HostClocks:
+        """All clocks of the host now."""
         ...
 
 
@@ -142,6 +142,6 @@ class LinuxKernel:
         """See `Kernel.monotonic_ns`."""
         return time.monotonic_ns()
 
-    def clocks_ns(self) -> tuple[int, int]:
-        """See `Kernel.clocks_ns`."""
-        return read_host_clocks()
+    def clocks(self) -> HostClocks:
+        """See `Kernel.clocks`."""
+        return read_all_clocks()

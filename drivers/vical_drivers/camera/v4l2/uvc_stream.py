@@ -107,14 +107,13 @@ class UvcMetadata:
 
     def _arrived_ns(self, buffer: DequeuedBuffer) -> int:
         """When the frame's first packet arrived, or at the latest did."""
-        now_ns, realtime_ns = self._kernel.clocks_ns()
+        now = self._kernel.clocks()
         if self._driver_stamps_capture:
-            return now_ns
-        return to_monotonic_ns(buffer.t_ns, now_ns, realtime_ns) or now_ns
+            return now.monotonic_ns
+        return to_monotonic_ns(buffer.t_ns, now) or now.monotonic_ns
 
     def _add(self, header: PayloadHeader) -> None:
-        monotonic_ns, realtime_ns = self._kernel.clocks_ns()
-        t_ns = to_monotonic_ns(header.t_host_ns, monotonic_ns, realtime_ns)
+        t_ns = to_monotonic_ns(header.t_host_ns, self._kernel.clocks())
         if t_ns is not None:  # uvcvideo may run on CLOCK_REALTIME (its parameter "clock")
             self._clock.add(header if t_ns == header.t_host_ns else replace(header, t_host_ns=t_ns))
 

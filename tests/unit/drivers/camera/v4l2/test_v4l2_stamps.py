@@ -122,6 +122,36 @@ def test_realtime_stamps_are_brought_to_the_monotonic_clock(open_fake) -> None:
     assert frame.stamp_rule == "soe(realtime)+exposure/2"
 
 
+@pytest.mark.parametrize("suspended_s", [1.0, 8.0, 3000.0])
+def test_stamps_that_count_suspended_time_are_brought_to_the_monotonic_clock(
+    open_fake, kernel, suspended_s: float
+) -> None:
+    """Android drivers stamp with CLOCK_BOOTTIME; that can look plausible after a short suspension."""
+    kernel.suspended_ns = round(suspended_s * 1e9)
+    camera = FakeCamera(stamps="soe", stamp_offset_ns=kernel.suspended_ns)
+    source = open_fake(camera, exposure_s=0.004)
+    for _ in range(5):
+        frame = source.read(1.0)
+        assert abs(frame.t_exposure_mid_ns - camera.truth[frame.sequence].t_mid_ns) < 1000
+        assert frame.stamp_rule == "soe(boottime)+exposure/2"
+
+
+@pytest.mark.parametrize("suspended_s", [0.0, 1.0, 8.0, 3000.0])
+@pytest.mark.parametrize("stalled_s", [0.0, 3.0, 15.0])
+def test_monotonic_stamps_stay_what_they_are_after_a_suspension(
+    open_fake, kernel, suspended_s: float, stalled_s: float
+) -> None:
+    camera = FakeCamera(stamps="soe")
+    source = open_fake(camera, exposure_s=0.004, buffers=16)
+    source.read(1.0)
+    kernel.suspended_ns = round(suspended_s * 1e9)
+    kernel.clock.sleep_until(kernel.clock.now_ns + round(stalled_s * 1e9))
+    for _ in range(20):
+        frame = source.read(1.0)
+        assert abs(frame.t_exposure_mid_ns - camera.truth[frame.sequence].t_mid_ns) < 1000
+        assert frame.stamp_rule == "soe+exposure/2"
+
+
 def test_unflagged_but_plausible_stamps_are_used_and_said_to_be(open_fake) -> None:
     camera = FakeCamera(stamps="eof", flags=abi.BUF_FLAG_TIMESTAMP_UNKNOWN)  # v4l2loopback
     frame = open_fake(camera).read(1.0)
