@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_input(parser)
     parser.add_argument(
         "--gravity", type=float, default=9.80665, metavar="G",
-        help="local gravity, m/s^2 (default 9.80665); an error becomes accelerometer scale",
+        help="local gravity, m/s^2 (default 9.80665 +- 0.015); an error becomes accelerometer scale",
     )  # fmt: skip
     parser.add_argument(
         "--min-rest",
@@ -52,10 +52,12 @@ def run(args: argparse.Namespace) -> int:
     if args.min_rest <= 0:
         raise CliError("--min-rest must be above 0", EXIT_USAGE)
     from vical_daemon.cli import imu_data
+    from vical_daemon.estimation.measurements import gravity_sigma_mps2
     from vical_daemon.estimation.tools.imu_static import calibrate_imu
 
     samples = imu_data.load(args)
-    found = calibrate_imu(samples.gyro_rps, samples.accel_mps2, samples.rate_hz, args.gravity, args.min_rest)
+    known = args.gravity, args.min_rest, gravity_sigma_mps2(args.gravity)
+    found = calibrate_imu(samples.gyro_rps, samples.accel_mps2, samples.rate_hz, *known)
     document = to_document(found)
     if args.output:
         write_output(Path(args.output), to_yaml(document, f"vical imu-calibrate {Path(args.input).name}"))

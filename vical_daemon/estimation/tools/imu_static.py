@@ -136,7 +136,7 @@ def _standard_error(samples: FloatArray) -> FloatArray:
 
 def calibrate_imu(
     gyro_rps: FloatArray, accel_mps2: FloatArray, rate_hz: float, gravity_mps2: float = 9.80665,
-    min_rest_s: float = 1.0,
+    min_rest_s: float = 1.0, gravity_sigma_mps2: float = 0.0,
 ) -> ImuCalibration:  # fmt: skip
     """Calibrate both triads from one recording of rests and turns.
 
@@ -146,6 +146,7 @@ def calibrate_imu(
         rate_hz: Sampling rate.
         gravity_mps2: Local gravity: the scale of everything the accelerometer says.
         min_rest_s: Shorter rests are ignored.
+        gravity_sigma_mps2: How well it is known, one sigma.
 
     Raises:
         PoorMotionError: Too few positions, or positions too much alike.
@@ -156,13 +157,17 @@ def calibrate_imu(
             f"only {len(rests)} rests of {min_rest_s:g} s found, {POSITIONS_MIN} needed: hold the imu still "
             "on each of its six faces and some edges in between"
         )
-    accel = calibrate_accelerometer(rests, gravity_mps2)
+    accel = calibrate_accelerometer(rests, gravity_mps2, gravity_sigma_mps2)
     gyro, found, motions = calibrate_gyro(gyro_rps, rests, accel, rate_hz)
     return ImuCalibration(accel, gyro, found, len(rests), motions)
 
 
-def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) -> SensorCalibration:
+def calibrate_accelerometer(
+    rests: list[Rest], gravity_mps2: float = 9.80665, gravity_sigma_mps2: float = 0.0
+) -> SensorCalibration:
     """Fit M_a (lower triangular) and b_a so that every rest shows gravity's length.
+
+    An error of gravity scales all of M_a; b_a and the gyro, which use directions alone, do not have it.
 
     Raises:
         PoorMotionError: The positions do not determine all nine unknowns to 2 %.
@@ -181,7 +186,8 @@ def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) ->
             "the positions are too much alike to tell the axes apart: put the imu on all six faces, "
             "each way up, and on some edges"
         )
-    return SensorCalibration(_lower(x[:6]), _lower(sigma[:6]), x[6:], sigma[6:], rms)
+    scaled = np.hypot(sigma[:6], x[:6] * (gravity_sigma_mps2 / gravity_mps2))
+    return SensorCalibration(_lower(x[:6]), _lower(scaled), x[6:], sigma[6:], rms)
 
 
 def calibrate_gyro(

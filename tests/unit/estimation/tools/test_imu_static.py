@@ -47,6 +47,17 @@ def test_matrices_correct_what_they_say_they_correct(simulate_turns):
     assert np.linalg.norm(corrected) == pytest.approx(9.80665, abs=0.003)
 
 
+def test_what_is_not_known_of_gravity_is_in_the_sigma_of_the_scale_alone(simulate_turns):
+    turns, wrong = simulate_turns(np.random.default_rng(3)), 9.80665 + 0.02
+    exact, off = (imu_static.calibrate_imu(*turns, RATE, g) for g in (9.80665, wrong))
+    known = imu_static.calibrate_imu(*turns, RATE, wrong, gravity_sigma_mps2=0.015)
+    scale = np.diag(off.accel.matrix - exact.accel.matrix)
+    assert np.abs(scale / np.diag(off.accel.matrix_sigma)).min() > 5.0
+    assert np.abs(scale / np.diag(known.accel.matrix_sigma)).max() < 1.5
+    np.testing.assert_allclose(known.accel.bias_sigma, off.accel.bias_sigma)
+    np.testing.assert_allclose(known.gyro.matrix_sigma, off.gyro.matrix_sigma)
+
+
 def test_too_few_positions_are_refused(simulate_turns):
     gyro, force = simulate_turns(np.random.default_rng(2), positions=4)
     with pytest.raises(imu_static.PoorMotionError, match="six faces"):
