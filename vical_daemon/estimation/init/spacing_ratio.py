@@ -21,7 +21,7 @@ from vical_daemon.estimation.model.target_modes import EXPECTED
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _TRIED = (-0.1, -0.05, 0.05, 0.1)  # logarithms of ratios; with another one a lens may run away
-_FAR = 0.2  # of the best of these no step should lead so far
+_FAR = 2.0 * max(_TRIED)  # of the best of these no step should lead so far
 _ROUNDS = 4  # lens and ratio in turn; the squared residuals are nearly a parabola of its logarithm
 _LEAST = SURE_SIGMAS * 2.0 * EXPECTED
 """Logarithm of the least ratio: one side longer and the other shorter by what the filter does not expect."""

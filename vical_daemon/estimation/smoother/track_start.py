@@ -37,7 +37,7 @@ ROUNDS = 8  # of reweighting by the depths found and by outliers
 _RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
 _STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
 _FINE_RAD = float(np.deg2rad(4.0))  # likewise about the best: the window converges from there
-_APART_RAD = float(np.deg2rad(45.0))  # from here on it is another mounting
+_APART_RAD = 3.0 * _STEP_RAD  # from here on it is another mounting
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
 

@@ -16,7 +16,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
 
-_STRETCHES = 6  # at most: their scatter is then known to a third
+STRETCHES = 6  # at most: their scatter is then known to a third
 _LEAST_ROWS = 20  # orientations in a stretch
 
 
@@ -78,7 +78,7 @@ def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArra
 
 def _stretches(problem: DriftProblem, used: BoolArray, sensors: int) -> list[slice]:
     """Cut the rows so that the information on the shifts is divided evenly: rest is no stretch of its own."""
-    count = min(_STRETCHES, int(np.count_nonzero(used)) // _LEAST_ROWS)
+    count = min(STRETCHES, int(np.count_nonzero(used)) // _LEAST_ROWS)
     if count < 2:
         return []
     by_shift = problem.J[:, :, 3 : 4 * sensors : 4].sum(axis=2)
