@@ -19,6 +19,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 GAP_S = 0.05
 """Between samples further apart than this nothing is known, s. A cubic over 50 ms misses a 3 Hz motion of
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
+EVEN = 1.5  # usual intervals: between even readings there is no longer one
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
 BLOCK_S = 5.005e-3

@@ -11,16 +11,14 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.block_means import BlockMeans, Mean
 from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, Six, SpikeFilter
-from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
+from vical_daemon.estimation.inertial.imu_buffer import EVEN, GAP_S, ImuBuffer
 from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
+from vical_daemon.estimation.measurements import IMAGE_GAP_S
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _CLIPPED_S = 5.0  # from the first clipped reading on, their share in each such stretch is looked at
 _MORE = 2.0  # times the share that was announced last is announced, too
-_UNSEEN_S = 0.5
-"""After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
 _APART_S = 10.0  # between two recordings on the common time axis: longer than any gap that is bridged
-_AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
 class Reading(NamedTuple):
@@ -194,7 +192,7 @@ class ImuIntake:
         if self._held is not None:
             held_s, held = self._held
             jump_s = abs(held_s - self._newest_s)
-            if 0.0 < t_s - held_s <= max(GAP_S, buffer.usual_gap_s, _AGAIN * jump_s):
+            if 0.0 < t_s - held_s <= max(GAP_S, buffer.usual_gap_s, EVEN * jump_s):
                 self.refused -= 1
                 return self._jump(buffer, held_s, held, t_s, reading)
         self._held = t_s, reading
@@ -276,7 +274,7 @@ class ImuIntake:
         Args:
             stated_s: How well the driver says that it knows the device's clock, one sigma, s.
         """
-        if self._newest_s > self.gap_end_s + _UNSEEN_S:
+        if self._newest_s > self.gap_end_s + IMAGE_GAP_S:  # no image will show any more what it was
             self._believe_gap()
         news, self._news = self._news + self._steps.news(stated_s), []
         return news

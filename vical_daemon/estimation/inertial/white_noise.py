@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from vical_daemon.estimation.inertial.imu_buffer import EVEN
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, MeasuredNoise
 
 _LENGTH = 64  # readings of a stretch
 _LEAST = 6  # stretches: with 16 frequencies and three channels the density is known to 5 %
 _MOTION_HZ = 12.0  # the tremor of hands ends there; slower IMUs do not tell noise from motion
-_EVEN = 1.5  # usual intervals: a stretch with a longer one has a gap
 _BANDS = 4  # parts of the upper half of the spectrum that are compared
 _MORE = 1.5
 """Times what a start shows: later motion may be rougher. EuRoC has up to 1.2 times the noise of its first 3 s
@@ -90,7 +90,7 @@ def _of_sensor(rows: FloatArray, columns: slice) -> float | None:
     step_s = float(np.median(np.diff(t_s)))
     first = max(_LENGTH // 4, math.ceil(_MOTION_HZ * step_s * _LENGTH)) + 1
     # a gap, or a reading that was written twice: the sensor measures less often than it is read
-    broken = (np.diff(t_s) > _EVEN * step_s) | (np.diff(values, axis=0) == 0.0).all(axis=1)
+    broken = (np.diff(t_s) > EVEN * step_s) | (np.diff(values, axis=0) == 0.0).all(axis=1)
     whole = ~sliding_window_view(broken, _LENGTH - 1)[:: _LENGTH // 2].any(axis=1)
     if whole.sum() < _LEAST or first > _LENGTH * 3 // 8:
         return None

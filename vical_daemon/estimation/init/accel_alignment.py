@@ -24,13 +24,11 @@ from vical_daemon.estimation.temporal.rotation_curves import running_integral
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
-_STEP_S = 0.01  # between windows, a fortieth of their length
+_STEP_S = _HALF_S / 20.0  # between windows
 PRIORS = 9
 """Rows of what is known before: lever arm, accelerometer bias and gyro bias."""
 _MIN_WINDOWS = 12  # 36 equations for a rotation and three vectors
-_COARSE_S = (
-    0.02  # grid of time shifts: a hand's acceleration changes over 0.1 s; a fifth of it about the best
-)
+_COARSE_S = 2.0 * _STEP_S  # grid of time shifts: what windows average changes slowly; a fifth about the best
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
 ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3

@@ -13,14 +13,14 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
-from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
+from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, inliers, planar_poses
 from vical_daemon.estimation.init.target_poses import ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MOST_STEPS
 
 MOST_VIEWS = 24  # spread over places, sizes and slants; the filter refines the lens
-_FEWEST, _LEAST_POINTS = 6, 12  # views, and points in each: a pose takes six numbers of each view
+_FEWEST = 6  # views
 _Poses = list[tuple[FloatArray, FloatArray]]
 # relative to fx for the first four; four for the distortion, and radtan's fifth
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
@@ -170,14 +170,14 @@ def _without_outliers(
     uv = project(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)
     far = np.linalg.norm(view.uv_px - uv, axis=1)
     good = inliers(far)
-    if good.all() or good.sum() < _LEAST_POINTS:
+    if good.all() or good.sum() < MIN_POINTS:
         return view
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
 
 
 def spread(frames: list[PointsFrame], lens: CameraState, most: int = MOST_VIEWS) -> list[int]:
     """Choose views with many points that differ most in where the board lies in the image."""
-    usable = [k for k, f in enumerate(frames) if len(f.ids) >= _LEAST_POINTS]
+    usable = [k for k, f in enumerate(frames) if len(f.ids) >= MIN_POINTS]
     if len(usable) <= most:
         return usable
     good = [frames[k] for k in usable]

@@ -21,7 +21,7 @@ from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _MAX_STEP_S = 0.25  # corners move straight for so long; over 0.3 s a hand looks like a rolling shutter
-_ROUNDS = 3  # lens and readout in turn
+ROUNDS = 4  # lens and readout, or another number that the images show, in turn
 _SHORT_S = 0.004  # readout that is compared with none, see `looks_rolling`
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
 
@@ -102,7 +102,7 @@ def readout(frames: Frames, lens: CameraState, target: FloatArray, given_s: floa
         given_s: First row to last, s.
     """
     found_s = given_s
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         fit = lens_fit(frames, lens, target, found_s)
         if fit is None:
             return given_s

@@ -14,15 +14,14 @@ import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.init.intrinsics_start import LensFit, along
-from vical_daemon.estimation.init.readout_start import lens_fit, most_of_a_readout
+from vical_daemon.estimation.init.readout_start import ROUNDS, lens_fit, most_of_a_readout
 from vical_daemon.estimation.measurements import FloatArray, Frames
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.target_modes import EXPECTED
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _TRIED = (-0.1, -0.05, 0.05, 0.1)  # logarithms of ratios; with another one a lens may run away
-_FAR = 0.2  # of the best of these no step should lead so far
-_ROUNDS = 4  # lens and ratio in turn; the squared residuals are nearly a parabola of its logarithm
+_FAR = 2.0 * max(_TRIED)  # of the best of these no step should lead so far
 _LEAST = SURE_SIGMAS * 2.0 * EXPECTED
 """Logarithm of the least ratio: one side longer and the other shorter by what the filter does not expect."""
 
@@ -57,7 +56,7 @@ def spacing_ratio(
             fits[tried] = other
     found = min(fits, key=lambda x: fits[x].rms_px)
     fit = fits[found]
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         step, bend = _step(fit, lens, stretched(target, math.exp(found)))
         if abs(step) < EXPECTED:  # it moves the target by less than the filter allows for in any case
             surely = found**2 * bend > SURE_SIGMAS**2 * fit.squares / fit.numbers

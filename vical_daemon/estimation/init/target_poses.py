@@ -17,8 +17,8 @@ from vical_daemon.estimation.geometry.planar_pose import (
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.temporal.camera_orientations import CORNER_PX
 
-_CORNER_PX = 0.2  # no orientation is better than a corner's position over the focal length
 _CLEANINGS = 3  # a gross outlier may hide lesser ones
 
 
@@ -76,7 +76,7 @@ def poses_of(
 
 def attitude_sigmas(poses: Sequence[TargetPose], camera: CameraState) -> FloatArray:
     """Of the poses as reported, but at least of corners that are a fifth of a pixel off, rad, shape (n,)."""
-    return np.maximum([p.sigma_rad for p in poses], _CORNER_PX / float(camera.intrinsics[0]))
+    return np.maximum([p.sigma_rad for p in poses], CORNER_PX / float(camera.intrinsics[0]))
 
 
 def ideal_views(

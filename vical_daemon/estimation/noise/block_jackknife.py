@@ -20,7 +20,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chance
 
-_LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3  # stretches: with two, one difference would stand for all scatter
 _LONGEST_RUN = 4  # stretches left out together: errors that last longer are taken as constant
@@ -131,7 +130,7 @@ class BlockJackknife:
         # covariance of the changes were errors independent: stretches do not tell equally much
         Q, spread = onto @ Q, np.vecdot(onto @ P, onto)
         C = np.einsum("rpi,rsij,spj->rsp", Q, left, Q, optimize=True) - spread
-        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * spread)
+        usual = np.maximum(np.einsum("rrp->rp", C), RIDGE * spread)
         ratio = (((without - values) @ onto.T) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))

@@ -8,10 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.robust import MEDIAN_CHI2
+from vical_daemon.estimation.robust import MEDIAN_CHI2, MOST_STEPS
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
-_ROUNDS = 8  # of scoring, from a start by medians
 ANNOUNCED_S = 3e-4
 """From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
 PERSISTENT = 0.5
@@ -37,7 +36,7 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
     Maximum likelihood by scoring.
     """
     variance = max(float(np.median(square)) / MEDIAN_CHI2 - float(np.median(usual)), 0.0)
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_STEPS):
         expected = usual + variance
         weight = expected**-2
         more = np.minimum(square, SURE_SIGMAS**2 * expected) - usual

@@ -20,9 +20,9 @@ from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SKEW_WALK
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.selection.model_mixture import joined, parts
 from vical_daemon.estimation.selection.model_selection import factor, lenses_known
+from vical_daemon.estimation.significance import EVERY_S
 
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
-_LEAST_S = 1.0  # of images before a drift is asked for
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:
@@ -59,7 +59,7 @@ def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
         stamp_sigma_s: How well the driver knows its device's clock, s.
         elapsed_s: Length of the data, s.
     """
-    return (2.0 * stamp_sigma_s / max(elapsed_s, _LEAST_S)) ** 2
+    return (2.0 * stamp_sigma_s / max(elapsed_s, EVERY_S)) ** 2
 
 
 def in_doubt(f: CalibrationFilter, camera: str, *, believed: bool) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
+from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
 from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
@@ -51,10 +52,9 @@ class _Found(NamedTuple):
 
 _REACH_S = 2.0  # time shifts that are looked for, to both sides of what is given
 _NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where strung-together turns show none
-_SPAN_S = 5.0  # of images in the first attempt
-_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # likewise at least; with a calibration to begin with
-_ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))  # of the mounting from rotations: a window converges from there
-_SHIFT_SIGMA_S = 4e-3  # of the time shift: likewise, 0.2 deg at 60 deg/s
+_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # of images in an attempt at least; with a calibration to begin with
+# of mounting and time shift from rotations: a window converges from there
+_ROTATION_SIGMA_RAD, _SHIFT_SIGMA_S = 2.0 * ROTATION_SIGMA_RAD, 2.0 * SHIFT_SIGMA_S
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 
@@ -97,9 +97,8 @@ class TargetFreeInitializer:
         if not (last or self.attempts.due(end_s)):
             return None
         shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
-        span = LONG_S if self.attempts.count > 1 else _SPAN_S
         usable = _last_stretch(
-            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
+            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), LONG_S
         )
         if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
             self.motion_missing = False

@@ -36,8 +36,7 @@ from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 ROUNDS = 8  # of reweighting by the depths found and by outliers
 _RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
 _STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
-_FINE_RAD = float(np.deg2rad(4.0))  # likewise about the best: the window converges from there
-_APART_RAD = float(np.deg2rad(45.0))  # from here on it is another mounting
+_APART_RAD = 3.0 * _STEP_RAD  # from here on it is another mounting
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
 
@@ -264,7 +263,7 @@ def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, a
             "the mounting about the one axis that the rig turns about does not show yet: speed up and brake,"
             " or turn the rig about a second axis"
         )
-    for step in (_STEP_RAD / 2.0, _FINE_RAD):
+    for step in (_STEP_RAD / 2.0, _STEP_RAD / 4.0):
         best += _vertex(step, *(misfit(best + x) ** 2 for x in (-step, 0.0, step)))
     return np.asarray(so3.exp(best * axis) @ R_imu_cam)
 

@@ -8,9 +8,8 @@ from typing import NamedTuple
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.plausible import usable_points
 
-STEP_S = 1.5  # the window is adjusted again after this much new data
+STEP_S = 1.5  # the window is adjusted again after so much new data; images further apart are not tied to it
 SLACK_S = 1e-3  # stamps are not quite even
-_MAX_GAP_S = 1.5  # images further apart are not tied by inertial data alone
 
 Stamped = tuple[float, PointsFrame]
 
@@ -41,11 +40,11 @@ def ready(waiting: Sequence[Stamped], begin_s: float, end_s: float) -> Ready:
     for t, frame in waiting:
         if t > end_s or before - begin_s > STEP_S - SLACK_S:
             break
-        if t - before > _MAX_GAP_S:
+        if t - before > STEP_S:
             return Ready(out, gap_follows=True, hole_s=0.0 if out else t - before)
         out.append((t, frame))
         before = t
-    silent = not out and bool(waiting) and end_s - begin_s > 2.0 * _MAX_GAP_S
+    silent = not out and bool(waiting) and end_s - begin_s > 2.0 * STEP_S
     return Ready(out, hole_s=end_s - begin_s if silent else 0.0)
 
 

@@ -29,7 +29,9 @@ _SPAN = 20  # estimates that are compared, one a second
 IMAGES = 10
 """Images refused in a row after which the pose is found again, and images after an alarm that show what has
 changed."""
-_SOON_S = 4.0  # after a pose that was found again; images refused in a row do not mean a lost pose then
+_SOON_S = BEFORE_S + EVERY_S
+"""For so long after a pose that was found again, s, images refused in a row do not mean a lost pose: the
+filters that are remembered (`RecentPast`) may be from before."""
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 
 

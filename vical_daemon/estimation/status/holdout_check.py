@@ -17,8 +17,8 @@ from vical_daemon.estimation.measurements import FloatArray, MeasuredNoise, Poin
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.robust import median
 
-HELD_BACK_EVERY_S = 1.5  # between two predictions: five times their length, so that they share nothing
 _AHEAD_S = 0.3  # of a prediction: noise of the readings then exceeds that of the corners
+HELD_BACK_EVERY_S = 5.0 * _AHEAD_S  # between two predictions, so that they share nothing
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
 _CLIP = 10.0  # that one prediction counts

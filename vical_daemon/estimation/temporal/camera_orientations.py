@@ -12,7 +12,7 @@ from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, PlanarPose,
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
 
-_CORNER_PX = 0.5  # noise of a corner per axis: scales the covariances only
+CORNER_PX = 0.2  # noise of a corner per axis, where its image does not say it
 _MAX_RMS_PX = 8.0  # a pose that misses its corners by more is a wrong detection
 
 
@@ -57,7 +57,7 @@ def target_orientations(
     Returns:
         The orientations with their covariances.
     """
-    sigma = _CORNER_PX / float(np.mean(intrinsics[:2]))
+    sigma = CORNER_PX / float(np.mean(intrinsics[:2]))
     stamps: list[int] = []
     poses: list[PlanarPose] = []
     frames = list(frames)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.robust import MEDIAN_CHI2_3
+from vical_daemon.estimation.robust import MEDIAN_CHI2_3, MOST_STEPS
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftProblem, DriftSolution, solve
 from vical_daemon.estimation.temporal.drift_smoother import cost as drift_cost
@@ -25,7 +25,6 @@ from vical_daemon.estimation.temporal.stretch_agreement import widening
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
 _GATE = chi_square_limit(3, PERHAPS_SIGMAS)  # of an orientation
-_ROUNDS = 12  # Gauss-Newton steps, at most; each finds again which orientations count
 _SHIFT_DONE_S = 2e-8  # a change of the shift below this ends it: a hundredth of the best sigmas
 # in which rounds the noises are estimated and with what steps, for one sensor and for several
 _SWEEPS = ({3: (0.5, 0.25), 5: (0.2,)}, {3: (0.5,), 5: (0.3,)})
@@ -151,7 +150,7 @@ def polish(
     curve = make_curve(bias)
     solution: DriftSolution | None = None
     rounds, done = 0, False
-    while rounds < _ROUNDS and not done:
+    while rounds < MOST_STEPS and not done:
         rounds += 1
         linear = linearise(curve, sensors, bias, options)
         sweeps = _SWEEPS[min(len(sensors) - 1, 1)].get(rounds, ())

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import GAP_PERIODS
 from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
 from vical_daemon.estimation.measurements import FloatArray
-
-_GAP = 2.5  # intervals longer than this many median intervals are holes in the data
 
 
 def running_integral(dt_s: FloatArray, values: FloatArray) -> FloatArray:
@@ -67,7 +66,7 @@ class GyroCurve:
         R = products(rotation_steps(rate[None], dt))[0]
         integral = running_integral(dt, R)
         # in a hole the rate is unknown: it may have differed from the straight line by its own usual size
-        hole = np.where(dt > _GAP * np.median(dt), dt, 0.0)
+        hole = np.where(dt > GAP_PERIODS * np.median(dt), dt, 0.0)
         extra = np.mean(np.vecdot(rate, rate)) / 3.0 * hole**2
         return cls(t_s, rate, R, integral, np.concatenate(([0.0], np.cumsum(extra))))
 

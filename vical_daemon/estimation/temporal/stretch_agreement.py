@@ -15,9 +15,9 @@ import numpy as np
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
-_STRETCHES = 6  # at most: their scatter is then known to a third
-_LEAST_ROWS = 20  # orientations in a stretch
+STRETCHES = 6  # at most: their scatter is then known to a third
 
 
 def widening(problem: DriftProblem, used: BoolArray, sensors: int) -> FloatArray:
@@ -78,7 +78,7 @@ def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArra
 
 def _stretches(problem: DriftProblem, used: BoolArray, sensors: int) -> list[slice]:
     """Cut the rows so that the information on the shifts is divided evenly: rest is no stretch of its own."""
-    count = min(_STRETCHES, int(np.count_nonzero(used)) // _LEAST_ROWS)
+    count = min(STRETCHES, int(np.count_nonzero(used)) // MIN_ORIENTATIONS)
     if count < 2:
         return []
     by_shift = problem.J[:, :, 3 : 4 * sensors : 4].sum(axis=2)
@@ -88,7 +88,7 @@ def _stretches(problem: DriftProblem, used: BoolArray, sensors: int) -> list[sli
     return [
         slice(a, b)
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-        if np.count_nonzero(used[a:b]) >= _LEAST_ROWS // 2
+        if np.count_nonzero(used[a:b]) >= MIN_ORIENTATIONS // 2
     ]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
-from vical_daemon.estimation.temporal.stretch_agreement import scatter_factors
+from vical_daemon.estimation.temporal.stretch_agreement import STRETCHES, scatter_factors
 from vical_daemon.estimation.temporal.td_icp import ENOUGH_S, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
@@ -23,7 +23,6 @@ from vical_daemon.estimation.temporal.track_orientations import track_orientatio
 Lens = tuple[FloatArray, FloatArray, str]
 
 _WINDOW_S = 20.0  # of a fit: a gyro's bias is constant over it
-_MOST_WINDOWS = 6  # two minutes in all, spread over a longer recording
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
 _INLIERS = 0.5  # share of the feature pairs that must fit
 
@@ -83,8 +82,8 @@ def _windows(frames: Frames) -> list[Frames]:
             stretches.append([])
         stretches[-1].append(frame)
     long = [s for s in stretches if s[-1][0] - s[0][0] >= ENOUGH_S]
-    if len(long) > _MOST_WINDOWS:
-        long = [long[i] for i in np.linspace(0, len(long) - 1, _MOST_WINDOWS).round().astype(int)]
+    if len(long) > STRETCHES:
+        long = [long[i] for i in np.linspace(0, len(long) - 1, STRETCHES).round().astype(int)]
     return long
 
 
