@@ -12,7 +12,7 @@ of the x and y accelerometers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -157,17 +157,16 @@ def calibrate_imu(
             f"only {len(rests)} rests of {min_rest_s:g} s found, {POSITIONS_MIN} needed: hold the imu still "
             "on each of its six faces and some edges in between"
         )
-    accel = calibrate_accelerometer(rests, gravity_mps2, gravity_sigma_mps2)
+    accel = calibrate_accelerometer(rests, gravity_mps2)
     gyro, found, motions = calibrate_gyro(gyro_rps, rests, accel, rate_hz)
+    # gravity scales all of M_a; the bias and the gyro, which use directions alone, do not have its error
+    by_gravity = accel.matrix * (gravity_sigma_mps2 / gravity_mps2)
+    accel = replace(accel, matrix_sigma=np.hypot(accel.matrix_sigma, by_gravity))
     return ImuCalibration(accel, gyro, found, len(rests), motions)
 
 
-def calibrate_accelerometer(
-    rests: list[Rest], gravity_mps2: float = 9.80665, gravity_sigma_mps2: float = 0.0
-) -> SensorCalibration:
+def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) -> SensorCalibration:
     """Fit M_a (lower triangular) and b_a so that every rest shows gravity's length.
-
-    An error of gravity scales all of M_a; b_a and the gyro, which use directions alone, do not have it.
 
     Raises:
         PoorMotionError: The positions do not determine all nine unknowns to 2 %.
@@ -186,8 +185,7 @@ def calibrate_accelerometer(
             "the positions are too much alike to tell the axes apart: put the imu on all six faces, "
             "each way up, and on some edges"
         )
-    scaled = np.hypot(sigma[:6], x[:6] * (gravity_sigma_mps2 / gravity_mps2))
-    return SensorCalibration(_lower(x[:6]), _lower(scaled), x[6:], sigma[6:], rms)
+    return SensorCalibration(_lower(x[:6]), _lower(sigma[:6]), x[6:], sigma[6:], rms)
 
 
 def calibrate_gyro(
