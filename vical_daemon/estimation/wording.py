@@ -367,7 +367,7 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     EventKind.LENS_STEPPED: "the lens changed, fx by {:+.1f px}: fix focus and zoom; "
     "a lens that is not fixed is estimated again, all else is kept",
     EventKind.BIASES_STEPPED: "the biases of the IMU stepped, the gyro's by {:.2f deg/s}: they are found "
-    "again, all else is kept; does the IMU zero its gyro at rest?",
+    "again, all else is kept; a shock, warming up, or a gyro that is zeroed at rest",
     EventKind.POSE_LOST: "the target was moved, or the pose was lost: it is found again, the "
     "calibration is kept",
     EventKind.CLOCK_DRIFT: "the time shift drifts: the clocks of camera and IMU run at different rates, by "
