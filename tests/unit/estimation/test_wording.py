@@ -64,7 +64,7 @@ def test_every_cause_has_a_text(cause):
         (
             Event(EventKind.BIASES_STEPPED, value=0.0148),
             "the biases of the IMU stepped, the gyro's by 0.85 deg/s: they are found again, all else is "
-            "kept; does the IMU zero its gyro at rest?",
+            "kept; a shock, warming up, or a gyro that is zeroed at rest",
         ),
         (
             Event(EventKind.CLOCK_DRIFT, "cam0", -5e-5, 1e-6),
