@@ -28,6 +28,8 @@ JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
 _WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
 _WANDERS_S = 5e-4  # three times what they show there; an exposure that varies moves the time shift by ms
+_MOST_ALIKE = 1.5
+"""Correlation of delays, as measured. A wrong lens or clipped readings move images for longer: it is 2 to 3."""
 WAYS = 3  # late, to the side, down
 
 
@@ -114,7 +116,7 @@ class SharedErrors:
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
         surely, alike = 1.0 - known.absent[0] > SURE, self._alike(0, self.jitter_s)
         self.jitter_found_s = self.jitter_s if surely and alike < PERSISTENT else 0.0
-        varies = surely and self.jitter_s > _WANDERS_S and PERSISTENT < alike < math.inf
+        varies = surely and self.jitter_s > _WANDERS_S and PERSISTENT < alike < _MOST_ALIKE
         self.wander_s = self.jitter_s if varies else 0.0
         wanders = self.shift_px > _WANDERS_PX and PERSISTENT < self._alike(1, self.shift_px) < math.inf
         self.wander_px = self.shift_px if wanders else 0.0
