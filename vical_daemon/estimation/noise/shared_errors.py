@@ -29,7 +29,7 @@ SHIFTS_PX = grid(2e-2)  # up to 3 px
 _WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
 _WANDERS_S = 5e-4  # three times what they show there; an exposure that varies moves the time shift by ms
 _MOST_ALIKE = 1.5
-"""Correlation of delays, as measured. A wrong lens or clipped readings move images for longer: it is 2 to 3."""
+"""Correlation of delays, as measured. Wrong lenses and clipped readings move images for longer: 2 to 3."""
 WAYS = 3  # late, to the side, down
 
 
