@@ -53,9 +53,7 @@ class _Found(NamedTuple):
 _REACH_S = 2.0  # time shifts that are looked for, to both sides of what is given
 _NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where strung-together turns show none
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # of images in an attempt at least; with a calibration to begin with
-_ROTATION_SIGMA_RAD = (
-    2.0 * ROTATION_SIGMA_RAD
-)  # of the mounting from rotations: a window converges from there
+_ROTATION_SIGMA_RAD = 2.0 * ROTATION_SIGMA_RAD  # of the mounting by rotations: a window converges from there
 _SHIFT_SIGMA_S = 4e-3  # of the time shift: likewise, 0.2 deg at 60 deg/s
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
