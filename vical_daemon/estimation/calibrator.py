@@ -37,7 +37,7 @@ from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch, suspect
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
-from vical_daemon.estimation.status.pending_change import Known, PendingChange
+from vical_daemon.estimation.status.pending_change import MOST_CHANGES, Known, PendingChange
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.what_jumped import Part, what_jumped
@@ -378,6 +378,8 @@ class Calibrator:
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
         """See which jump explains the images best, of those that orientations do not show."""
+        if self._change is not None and self._change.number >= MOST_CHANGES:
+            return False
         after_gap = self._change is None and self.watch.motion_is_new(before.state.t_s)
         found = what_jumped(before, self._past.since(), camera, self._step, after_gap=after_gap)
         if found is None or (stepped and found.part in (Part.SHIFT, Part.DRIFT)):

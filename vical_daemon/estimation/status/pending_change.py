@@ -54,6 +54,10 @@ class Known(NamedTuple):
         return out
 
 
+MOST_CHANGES = 2
+"""Decided in a row: the time shift, say, and then what orientations do not show. A third: none is right."""
+
+
 @dataclass(frozen=True, slots=True)
 class PendingChange:
     """What was decided last.
@@ -64,6 +68,7 @@ class PendingChange:
         camera: The one whose images did not fit.
         at_s: When it was decided, s.
         before: Cameras just before the change.
+        number: How many in a row have been decided so far, none of them confirmed.
     """
 
     part: Part
@@ -71,6 +76,7 @@ class PendingChange:
     camera: str
     at_s: float
     before: Mapping[str, Known]
+    number: int = 1
 
     def confirmed(self, t_s: float) -> bool:
         """Whether images have not contradicted it for long enough."""
@@ -105,7 +111,7 @@ class PendingChange:
 
     def after(self, earlier: PendingChange | None) -> PendingChange:
         """This change if another was pending: what is known is compared with what it was before both."""
-        return self if earlier is None else replace(self, before=earlier.before)
+        return self if earlier is None else replace(self, before=earlier.before, number=earlier.number + 1)
 
     def news(self, f: CalibrationFilter) -> Event | None:
         """What is to be announced of a change that is confirmed, of filter `f`, and was not announced yet.
