@@ -88,7 +88,7 @@ def test_a_step_within_what_the_driver_leaves_open_is_one_of_its_stamps(stamps_s
 
 
 def test_after_two_changes_in_a_row_that_did_not_hold_none_is_believed(monkeypatch):
-    """A camera turned by 2 deg, moved by 10 mm and 5 ms late: time shift, then biases eighteen times, `converged`.
+    """A camera turned by 2 deg, moved by 10 mm and 5 ms late: time shift, then biases eighteen times.
 
     `python -m benchmarks changes`, seed 9. The motion had been found again with the mounting of before.
     """
