@@ -56,13 +56,13 @@ def before_a_crooked_board(seed, rate_hz):
     return simulate(seed, 25.0, rig=rig, points_m=crooked_board(seed), camera_rate_hz=rate_hz)
 
 
-def calibrate(run, estimate=frozenset(), *, lens_held=False, each=None):
+def calibrate(run, estimate=frozenset(), *, lens_held=False, each=None, **known):
     lens = run.rig.lens
     start = CameraPrior((640, 480), (530.0, 530.0, 322.0, 236.0), lens.model)
     if lens_held:
         start = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
     fix = frozenset({"intrinsics"} if lens_held else ())
-    options = CalibrationOptions(fix=fix, estimate=estimate)
+    options = CalibrationOptions(fix=fix, estimate=estimate, **known)
     return test_calibrator.calibrate(run, options, {"cam0": start}, each=each, target_m=BOARD)
 
 
@@ -125,13 +125,14 @@ def test_with_the_lens_held_it_is_the_board_that_is_found_and_not_the_lens(seed)
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypatch):
     run = simulate(seed, 14.0)
-    c, asked = calibrate(run), calibrate(run, frozenset({"target_shape"}))
+    exact = {"gravity_sigma_mps2": 1e-6}  # what the board alone costs
+    c, asked = calibrate(run, **exact), calibrate(run, frozenset({"target_shape"}), **exact)
     estimate = c.estimate()
     assert not {EventKind.TARGET_SHAPE, EventKind.TARGET_SIZE} & {e.kind for e in estimate.events}
     assert estimate.status == Status.CONVERGED
     assert off(c.filter, TARGET) < 0.01
     sigma, asked_sigma = (np.array(e.cameras["cam0"].intrinsics_sigma) for e in (estimate, asked.estimate()))
-    assert np.linalg.norm(sigma[2:]) < 0.75 * np.linalg.norm(asked_sigma[2:])  # image centre
+    assert sigma[2:].max() < 0.75 * asked_sigma[2:].max()  # image centre
     monkeypatch.setattr(
         "vical_daemon.estimation.selection.model_selection.in_doubt", lambda *_, **_how: TARGET
     )
