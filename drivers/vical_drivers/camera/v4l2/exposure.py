@@ -86,6 +86,16 @@ def _set_gain(controls: Controls, gain: float) -> None:
     controls.set(which, round(gain))
 
 
+def is_automatic(controls: Controls) -> bool:
+    """Return whether the camera chooses its exposure itself, and could be told one."""
+    if controls.find(abi.CID_EXPOSURE_ABSOLUTE) is None or controls.find(abi.CID_EXPOSURE_AUTO) is None:
+        return False
+    try:
+        return controls.get(abi.CID_EXPOSURE_AUTO) not in _FIXED_EXPOSURE
+    except DeviceRefusedError:
+        return False
+
+
 def read_exposure_ns(controls: Controls) -> int | None:
     """Return the exposure time in force, ns; None where unknown or chosen by the camera itself."""
     if controls.find(abi.CID_EXPOSURE_ABSOLUTE) is None:
