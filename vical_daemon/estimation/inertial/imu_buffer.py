@@ -238,10 +238,11 @@ class ImuBuffer:
         nodes[begin[:-1]], nodes[begin[1:] - 1] = ends[:-1], ends[1:]
         return np.asarray(nodes)
 
-    def turning(self, t_s: FloatArray, half_s: float) -> tuple[FloatArray, FloatArray]:
-        """How the imu turns about instants.
+    def around(self, t_s: FloatArray, half_s: float) -> tuple[FloatArray, FloatArray]:
+        """Rate and specific force around instants, and their derivatives.
 
-        Its turn in a time u is rate u + acceleration u^2 / 2, exactly so at u = +-half_s.
+        The imu's turn in a time u is rate u + derivative u^2 / 2, exactly so at u = +-half_s; likewise its
+        velocity by the specific force.
 
         A single reading is noisy, and differences between images miss what a hand shakes in between.
 
@@ -250,15 +251,15 @@ class ImuBuffer:
             half_s: How far around them; less next to the ends of the readings.
 
         Returns:
-            Measured rate, rad/s, and its derivative, rad/s^2, shapes (m, 3).
+            Rate, rad/s, and specific force, m/s^2, as one, shape (m, 6); likewise their derivatives.
         """
         rows = self.rows
         first = max(int(rows[:, 0].searchsorted(t_s[0] - half_s)) - 2, 0)
         rows = rows[first : int(rows[:, 0].searchsorted(t_s[-1] + half_s)) + 2]
         t = rows[:, 0]
         half = np.clip(np.minimum(t_s - t[0], t[-1] - t_s), _LEAST_HALF_S, half_s)
-        turns = _Turns(rows[:, :4], _slopes(rows, 0, len(rows))[:, :3])
-        before, at, after = turns.at(np.concatenate([t_s - half, t_s, t_s + half])).reshape(3, -1, 3)
+        sums = _Integrals(rows[:, :7], _slopes(rows, 0, len(rows)))
+        before, at, after = sums.at(np.concatenate([t_s - half, t_s, t_s + half])).reshape(3, -1, 6)
         half = half[:, None]
         return (after - before) / (2.0 * half), (after - 2.0 * at + before) / half**2
 
@@ -270,23 +271,23 @@ def _moved(values: FloatArray, live: slice, length: int) -> FloatArray:
     return out
 
 
-class _Turns:
-    """Integral of the rate along cubics between readings: t_s, gyro xyz (n, 4) and slopes (n, 3)."""
+class _Integrals:
+    """Integrals of readings along cubics between them: t_s, gyro xyz, accel xyz (n, 7) and slopes (n, 6)."""
 
     def __init__(self, rows: FloatArray, slope: FloatArray) -> None:
-        self._t, self._rate, self._slope = rows[:, 0], rows[:, 1:], slope
+        self._t, self._read, self._slope = rows[:, 0], rows[:, 1:], slope
         h = np.diff(self._t)[:, None]
-        steps = 0.5 * h * (self._rate[:-1] + self._rate[1:]) + h * h / 12.0 * (slope[:-1] - slope[1:])
-        self._sum = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        steps = 0.5 * h * (self._read[:-1] + self._read[1:]) + h * h / 12.0 * (slope[:-1] - slope[1:])
+        self._sum = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])
 
     def at(self, t_s: FloatArray) -> FloatArray:
-        """From the first reading to instants, rad, shape (m, 3)."""
+        """From the first reading to instants, rad and m/s, shape (m, 6)."""
         k = np.clip(self._t.searchsorted(t_s, side="right") - 1, 0, len(self._t) - 2)
         h = (self._t[k + 1] - self._t[k])[:, None]
         u = (t_s - self._t[k])[:, None] / h
-        A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._rate[k + 1] - self._rate[k]
+        A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._read[k + 1] - self._read[k]
         bent = 0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
-        return np.asarray(self._sum[k] + u * h * (self._rate[k] + u * bent))
+        return np.asarray(self._sum[k] + u * h * (self._read[k] + u * bent))
 
 
 def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:

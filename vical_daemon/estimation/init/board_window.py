@@ -252,7 +252,7 @@ class BoardWindow:
         assert found is not None  # links have been made over the same
         segment, begin = found
         at = np.append(begin, len(segment.t_s) - 1)
-        self._measured = segment.gyro[at], segment.accel[at], self._buffer.turning(t_s, SLOPE_S)[1]
+        self._measured = segment.gyro[at], segment.accel[at], self._buffer.around(t_s, SLOPE_S)[1][:, :3]
 
     def _find_rates(self) -> None:
         s = self.state

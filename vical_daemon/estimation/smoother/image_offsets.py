@@ -36,7 +36,7 @@ class ImageOffsets:
 
     def __init__(self, window: Window, e: FloatArray, J: FloatArray, sigmas: FloatArray) -> None:
         self.ways = np.flatnonzero(sigmas)
-        moves = _moves(window)[:, :, self.ways]
+        moves = window.moves[:, :, self.ways]
         self._begin = -np.matmul(J[:, :, :9], moves[:-1])
         self._end = -np.matmul(J[:, :, 9:18], moves[1:])
         F, n = len(moves), len(self.ways)
@@ -150,14 +150,13 @@ class ImageOffsets:
         return out
 
 
-def _moves(window: Window) -> FloatArray:
+def moves(window: Window) -> FloatArray:
     """[turn, p, v] of each image by the second and by the px to the side and down, shape (F, 9, 3).
 
     By the second: turning rate in the imu frame, velocity, acceleration in the world.
     """
-    t = np.array([s for s, _ in window.frames])
-    late = np.concatenate([window.rates(), window.v, np.gradient(window.v, t, axis=0)], axis=1)
-    out = np.zeros((len(t), 9, 3))
+    late = np.concatenate([window.rates(), window.v, window.accelerations()[1]], axis=1)
+    out = np.zeros((len(late), 9, 3))
     out[:, :, 0] = late
     camera = window.camera
     out[:, :3, 1] = -camera.R_imu_cam[:, 1] / camera.intrinsics[0]

@@ -16,7 +16,7 @@ from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
 from vical_daemon.estimation.noise.stamp_jitter import evidence, excess
 from vical_daemon.estimation.robust import huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS
-from vical_daemon.estimation.smoother.image_offsets import FLOORS, LATE, SHIFTED, ImageOffsets
+from vical_daemon.estimation.smoother.image_offsets import FLOORS, LATE, SHIFTED, ImageOffsets, moves
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
 from vical_daemon.estimation.smoother.marginal_prior import (
     BIASES,
@@ -123,6 +123,7 @@ class Problem:
         seen = patches_seen(uv, carry.camera.resolution)
         # of the information in the prior of the own lens
         self.lens_root = patches(carry.camera, seen) / noise.lens_px
+        window.moves = moves(window)
 
     def order(self) -> Order:
         """Places of the unknowns."""

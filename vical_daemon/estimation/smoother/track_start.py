@@ -113,7 +113,7 @@ class TrackStart:
         )
         window.bias[:, :3] = imu[:3]
         window.fit_knots()
-        window.measure_turning(buffer)
+        window.measure(buffer)
         self._seen = window.observe()
         if len(self._seen.begin) < MIN_FEATURES:
             raise NoStartError(

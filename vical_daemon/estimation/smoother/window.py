@@ -94,7 +94,9 @@ class Window:
             (17,) or (23,).
         own_lens: What fx fy cx cy and the distortion differ by in this window, see `LensMisfit`, shape (n,).
         jumps: See `MarginalPrior`.
-        turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
+        measured: Rate, rad/s, and specific force, m/s^2, around each image (with biases), and their
+            derivatives, shape (2, F, 6).
+        moves: See `image_offsets.moves`; held during an adjustment, as its derivatives do not count.
     """
 
     camera: CameraState
@@ -111,7 +113,8 @@ class Window:
     bad: set[tuple[int, int]] = field(default_factory=set)
     own_lens: FloatArray = field(default_factory=lambda: np.zeros(0))
     jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
-    turning: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 3)))
+    measured: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 6)))
+    moves: FloatArray = field(default_factory=lambda: np.zeros((0, 9, 3)))
 
     def __post_init__(self) -> None:
         if not len(self.own_lens):
@@ -153,9 +156,12 @@ class Window:
 
     def rates(self) -> FloatArray:
         """Angular rate at each image, bias removed, rad/s, shape (F, 3)."""
+        return np.asarray((self.measured[0] - self._biases())[:, :3] @ self.gyro_matrix.T)
+
+    def _biases(self) -> FloatArray:
+        """Of gyro and accelerometer at each image, shape (F, 6)."""
         knots = self.knots()
-        rates = self.turning[0] - self.bias[np.concatenate([knots[:1], knots]), :3]
-        return np.asarray(rates @ self.gyro_matrix.T)
+        return self.bias[np.concatenate([knots[:1], knots])]
 
     def imu_by_link(self) -> FloatArray:
         """Bias in force on each link, and numbers of the imu, shape (F - 1, 6 or 22 or 28)."""
@@ -164,11 +170,8 @@ class Window:
 
     def accelerations(self) -> tuple[FloatArray, FloatArray]:
         """Angular (imu frame) and linear (world) acceleration at each image, shapes (F, 3)."""
-        if len(self.frames) < 2:
-            return np.zeros_like(self.v), np.zeros_like(self.v)
-        t = np.array([s for s, _ in self.frames])
-        turning = self.turning[1] @ self.gyro_matrix.T
-        return turning, np.gradient(self.v, t, axis=0)
+        force = (self.measured[0] - self._biases())[:, 3:] @ matrices(self.imu[1:])[1].T
+        return self.measured[1, :, :3] @ self.gyro_matrix.T, np.matvec(self.R, force) + self.gravity
 
     def extend(self, buffer: ImuBuffer, frames: Frames) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
@@ -192,14 +195,14 @@ class Window:
         self.frames += frames[:count]
         self.R, self.p, self.v = np.concatenate(R), np.concatenate(p), np.concatenate(v)
         self.fit_knots()
-        self.measure_turning(buffer)
+        self.measure(buffer)
         return count
 
-    def measure_turning(self, buffer: ImuBuffer) -> None:
-        """Take from the readings how the imu turns at each image, at the time shift of the links."""
+    def measure(self, buffer: ImuBuffer) -> None:
+        """Take from the readings how the imu moves at each image, at the time shift of the links."""
         instants = np.array([t for t, _ in self.frames]) + self.shift_s
-        # rates hold for half a readout of 30 ms before and after an image
-        self.turning = np.array(buffer.turning(instants, WINDOW_START.readout_s))
+        # they hold for half a readout of 30 ms before and after an image
+        self.measured = np.array(buffer.around(instants, WINDOW_START.readout_s))
 
     def relink(self, buffer: ImuBuffer) -> bool:
         """Integrate again at the present time shift and biases; False where inertial data do not reach."""
@@ -209,24 +212,19 @@ class Window:
         links = make_links(buffer, instants, self.imu_by_link(), self.noise)
         if links is None:
             return False
-        rates = self.rates()
+        rates, (_, acceleration) = self.rates(), self.accelerations()
         self.p = self.p + d * self.v
         self.R = self.R @ so3.exp(d * rates)
-        if len(self.v) > 1:
-            t = np.array([s for s, _ in self.frames])
-            self.v = self.v + d * np.gradient(self.v, t, axis=0)
+        self.v = self.v + d * acceleration
         self.links, self.shift_s = links, self.camera.timeshift_s
-        self.measure_turning(buffer)
+        self.measure(buffer)
         return True
 
     def last_at(self, shift_s: float) -> tuple[FloatArray, FloatArray]:
         """Attitude and velocity at the last image for a time shift a little off that of the links."""
         d = shift_s - self.shift_s
-        if len(self.frames) < 2:
-            return self.R[-1].copy(), self.v[-1].copy()
-        step_s = self.frames[-1][0] - self.frames[-2][0]
         turned = self.R[-1] @ so3.exp(d * self.rates()[-1])
-        return turned, self.v[-1] + (d / step_s) * (self.v[-1] - self.v[-2])
+        return turned, self.v[-1] + d * self.accelerations()[1][-1]
 
     def stale(self) -> bool:
         """Whether the links hold for another time shift or other biases than are believed now."""

@@ -151,7 +151,7 @@ def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
     for k in range(120):
         buffer.append(0.01 * k, np.array([0.02 * np.sin(w * 0.01 * k), 0.3, 0.0]), np.zeros(3))
     t = np.array([0.0, 0.2137, 0.5, 0.9731])
-    rate, change = buffer.turning(t, half_s)
+    rate, change = (x[:, :3] for x in buffer.around(t, half_s))
 
     def turn(a, b):
         return np.stack([0.02 / w * (np.cos(w * a) - np.cos(w * b)), 0.3 * (b - a), 0.0 * a], axis=-1)
@@ -161,7 +161,7 @@ def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
         assert np.abs((found - turn(t, t + u))[1:]).max() < 2e-5  # of 3e-4: what a readout of 30 ms sees
     assert np.abs(rate[0] - [0.02 * np.sin(w * 1e-3) * 0.0, 0.3, 0.0]).max() < 2e-3  # at the first reading
     slow = filled()
-    assert np.abs(slow.turning(np.array([0.7, 2.0]), 0.01)[0] - rates([0.7, 2.0])).max() < 1e-3
+    assert np.abs(slow.around(np.array([0.7, 2.0]), 0.01)[0][:, :3] - rates([0.7, 2.0])).max() < 1e-3
 
 
 @pytest.mark.parametrize("readings", [0, 500])

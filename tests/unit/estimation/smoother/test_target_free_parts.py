@@ -20,10 +20,9 @@ from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother import image_offsets
 from vical_daemon.estimation.smoother.bundle import Bundle, correlation
 from vical_daemon.estimation.smoother.handover import initial_prior
-from vical_daemon.estimation.smoother.image_offsets import ImageOffsets
+from vical_daemon.estimation.smoother.image_offsets import ImageOffsets, moves
 from vical_daemon.estimation.smoother.inertial import Order
 from vical_daemon.estimation.smoother.marginal_prior import CORE, first_carry, later
 from vical_daemon.estimation.smoother.normal import ImageNoise
@@ -260,9 +259,17 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
 
 
+def test_accelerations_at_images_are_those_of_the_motion_however_far_images_are_apart(scene):
+    window = scene.window(frames=scene.frames[::5])
+    t_s = np.array([t for t, _ in window.frames]) + SHIFT_S
+    force = np.matvec(np.swapaxes(window.R, 1, 2), window.accelerations()[1] - window.gravity)
+    true = scene.rig.imu_motion(t_s)[1] + scene.rig.accel_bias.value(0.0)
+    np.testing.assert_allclose(force, true, atol=0.08)  # noise; differences of velocities: 1.3
+
+
 def errors_where_images_are_off(window, offsets):
     """Errors of the links if image k was taken offsets[k, 0] s late, and lies offsets[k, 1:] px off."""
-    rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
+    rates, push = window.rates(), window.accelerations()[1]
     late, (right, down), camera = offsets[:, :1], offsets[:, 1:].T, window.camera
     # a camera that turns about its x axis sees everything lower, about its y axis more to the left
     turn = np.column_stack([down / camera.intrinsics[1], -right / camera.intrinsics[0], 0.0 * down])
@@ -295,6 +302,7 @@ def test_images_that_are_off_are_eliminated_as_unknowns_of_their_own(scene, sigm
     gain = np.linalg.solve(B.T @ B + np.diag(np.tile(sigmas[ways] ** -2.0, F)), B.T)
     H, g = wide.T @ wide, wide.T @ e.ravel()
     wanted_H, wanted_g = H - wide.T @ B @ gain @ wide, g - wide.T @ B @ gain @ e.ravel()
+    window.moves = moves(window)
     offsets = ImageOffsets(window, e, J, sigmas)
     offsets.eliminate(H, g, J, at)
     np.testing.assert_allclose(H, wanted_H, atol=1e-4 * np.abs(wanted_H).max())
@@ -316,6 +324,7 @@ def test_images_that_are_late_alike_are_no_jitter(scene, case):
         off[:, 0] = np.where(np.arange(count) < count // 2, -1e-3, 1e-3)
     right, J = window.links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)
     e = errors_where_images_are_off(window, off) - right
+    window.moves = moves(window)
     alike = ImageOffsets(window, e, J, np.array([1e-3, 0.0, 0.0])).alike()
     assert alike > 0.8 if case == "step" else abs(alike) < 0.4
 
@@ -342,11 +351,10 @@ def test_a_window_tells_late_images_from_shifted_ones(scene, off):
     assert error @ np.linalg.solve(P, error) < 27.9  # chi-square, 9 degrees of freedom, 99.9 %
 
 
-def test_at_rest_no_image_can_be_seen_to_be_late(scene, monkeypatch):
-    moves = image_offsets._moves
-    monkeypatch.setattr(image_offsets, "_moves", lambda window: moves(window) * [0.0, 1.0, 1.0])
+def test_at_rest_no_image_can_be_seen_to_be_late(scene):
     window = scene.window()
     problem = bundle_of(window, POSE_AND_CLOCK, 1.0).problem
+    window.moves = window.moves * [0.0, 1.0, 1.0]
     assert problem.suspected(problem.view(window.observe())).jitter_s == 0.0
 
 
