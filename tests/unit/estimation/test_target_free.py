@@ -304,6 +304,14 @@ def test_where_everything_is_far_away_there_is_no_answer_and_it_says_why():
     assert any("everything is far away, or features are lost before" in reason for reason in reasons)
 
 
+def test_a_scene_with_too_few_features_is_told():
+    """A lens of 12 degrees sees a few of them: 25 s of `collecting the first seconds`."""
+    run = simulated(seconds=8.0)
+    few = [replace(f, ids=f.ids[:5], uv_px=f.uv_px[:5]) for f in run.frames]
+    record = feed(replace(run, frames=few), subject_for(run))
+    assert record.statuses[-1][2].startswith("most images show only 5 features, fewer than 12: ")
+
+
 def test_one_axis_is_never_called_converged():
     rig = looking(3, one_axis, 3, [0.3, 1.0, 0.2])
     run = simulate_tracks(3, 20.0, rig=rig, camera_rate_hz=8.0)

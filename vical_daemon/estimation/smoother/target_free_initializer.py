@@ -102,7 +102,10 @@ class TargetFreeInitializer:
         )
         if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
             self.motion_missing = False
-            return "collecting the first seconds: move the rig, keep textured things in view"
+            return (
+                _too_few_features(frames, end_s)
+                or "collecting the first seconds: move the rig, keep textured things in view"
+            )
         self.attempts.tried(end_s)
         self.motion_missing = True
         if _still(usable):
@@ -323,6 +326,17 @@ def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -
         out.append((t, frame))
     every = max(1, math.ceil(len(out) / _MOST_IMAGES))
     return out[::every][::-1]
+
+
+def _too_few_features(frames: Frames, end_s: float) -> str:
+    """What to do if most images of the last seconds show too few features to be used; empty: they do not."""
+    counts = [len(frame.ids) for t, frame in frames if end_s - LONG_S < t <= end_s]
+    if not counts or end_s - frames[0][0] < _LEAST_S or np.median(counts) >= MIN_FEATURES:
+        return ""
+    return (
+        f"most images show only {np.median(counts):.0f} features, fewer than {MIN_FEATURES}: "
+        "more texture or light is needed"
+    )
 
 
 def _still(frames: Frames) -> bool:

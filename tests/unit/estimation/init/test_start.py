@@ -60,6 +60,17 @@ def test_a_small_board_a_hand_away():
     within(record, 4.5, parameters=15)
 
 
+@pytest.mark.parametrize("distance_m", [3.0, 5.0])
+def test_a_board_far_away_is_told_to_come_closer(distance_m):
+    """Without it: `turn the rig faster`, or `the target is seen in 9 frames so far: show the whole board`."""
+    p = np.array([0.01, 0.025, -0.098])
+    motion = hand_motion(23, T_imu_cam=(np.eye(3), p), board_size_m=(0.35, 0.25), distance_m=distance_m)
+    rig = reference_rig(23, trajectory=motion, R_imu_cam=np.eye(3), p_imu_cam=p)
+    record, _ = answer(simulate(23, 8.0, rig=rig, corner_sigma_px=1.0), lens_known=True)
+    reason = record.statuses[-1][2]
+    assert not record.snapshots and "come closer, so that it fills the image" in reason, reason
+
+
 @pytest.fixture(scope="module")
 def dirty():
     return simulate(1, 7.0, timeshift_cam_imu_s=0.03, outlier_fraction=0.05, hidden_fraction=0.3)
