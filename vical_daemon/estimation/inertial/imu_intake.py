@@ -239,6 +239,7 @@ class ImuIntake:
     @staticmethod
     def _append(buffer: ImuBuffer, mean: Mean | None) -> None:
         if mean is not None:
+            buffer.spread_s2 = max(buffer.spread_s2, mean.spread_s2)
             buffer.append(mean.t_s, mean.six[:3], mean.six[3:], mean.clipping_sigma)
 
     def saw_image(self, ahead_s: float) -> None:
