@@ -32,6 +32,7 @@ from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
     LinearityMonitor,
+    bent_by_jitter,
     by_derivatives,
     by_sigma_points,
     is_rolling,
@@ -279,6 +280,7 @@ class CalibrationFilter:
             lin.by_shared = lin.by_error @ shared_ways(self.state, self.layout, image.camera)
             if shared.jitter_s or shared.shift_px:
                 lin.shared = lin.by_shared * shared.sigmas
+            lin.z = lin.z + bent_by_jitter(self.state, self.layout, self.rates, image, shared.jitter_s)
         return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:

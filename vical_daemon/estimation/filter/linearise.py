@@ -26,6 +26,7 @@ from vical_daemon.estimation.model.retract import camera_points, pose_points
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, Layout, State
 from vical_daemon.estimation.model.target_modes import MODES
 from vical_daemon.estimation.model.target_view import view
+from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
@@ -134,6 +135,24 @@ def project_errors(
     for _ in range(_ROW_STEPS if uv is None else 0):
         rows = read_share(project(rows), known.resolution, known.readout_axis)
     return project(rows)
+
+
+def bent_by_jitter(
+    state: State, layout: Layout, rates: Rates, image: Image, jitter_s: float
+) -> FloatArray | float:
+    """By how much stamps that jitter move the mean of the pixels, px, shape (n, 2); 0: not by much.
+
+    A camera does not go on at one rate along a straight line, so an image early and one late do not cancel.
+    By sigma points of the stamp.
+    """
+    at = layout.cameras[image.camera].timeshift
+    if at is None or jitter_s < ANNOUNCED_S:
+        return 0.0
+    errors = np.zeros((3, layout.size))
+    errors[1:, at] = jitter_s, -jitter_s
+    uv = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
+    bent = 0.5 * (uv[1] + uv[2]) - uv[0]
+    return np.where(np.isfinite(bent), bent, 0.0)
 
 
 def is_rolling(state: State, layout: Layout, camera: str) -> bool:

@@ -3,8 +3,8 @@
 The time shift shows in how the rate changes between two images. From 1000 readings a second, one at either
 image, that change is mostly noise where the rig moves slowly, and noise squared counts as information: the
 time shift stays where it began, at a sigma that is far too small. A mean over a block is what the gyro turned
-in that time. It is less than the rate in the middle of a swing: by 0.04 % of a motion at 3 Hz, (pi f T)^2 / 6,
-which the buffer adds again.
+in that time. It is less than the rate in the middle of a swing, by 0.04 % of a motion at 3 Hz,
+(pi f T)^2 / 6. The buffer adds that again.
 """
 
 from __future__ import annotations

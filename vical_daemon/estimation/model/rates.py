@@ -20,8 +20,8 @@ class Rates(NamedTuple):
     Attributes:
         omega: Angular rate in the imu frame, rad/s, shape (3,).
         accel: Acceleration in the world (gravity included), m/s^2, shape (3,).
-        alpha: Angular acceleration in the imu frame, rad/s^2, shape (3,); needed by the rows of a rolling
-            shutter only: half a readout of 20 ms later a hand turned by 0.1 deg more than its rate says.
+        alpha: Angular acceleration in the imu frame, rad/s^2, shape (3,). Half a readout of 20 ms later a
+            hand has turned by 0.1 deg more than its rate says.
     """
 
     omega: FloatArray
@@ -35,12 +35,12 @@ def rates_after(state: State, segment: ImuSegment, before: Rates) -> Rates:
     Args:
         state: At that instant.
         segment: Readings that lead there; may have no length.
-        before: What it was thought to be; stands for the angular acceleration that nothing needs or shows.
+        before: What it was thought to be; stands for the angular acceleration where nothing shows it.
     """
     omega = state.gyro_matrix @ (segment.gyro[-1] - state.gyro_bias)
     force = state.accel_matrix @ (segment.accel[-1] - state.accel_bias)
     alpha = before.alpha
-    if segment.t_s[-1] > segment.t_s[0] and any(c.readout_s for c in state.cameras.values()):
+    if segment.t_s[-1] > segment.t_s[0]:
         alpha = state.gyro_matrix @ _late_slope(segment.t_s, segment.gyro)
     return Rates(omega, state.R_world_imu @ force + state.gravity, alpha)
 

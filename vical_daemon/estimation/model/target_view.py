@@ -20,7 +20,7 @@ from vical_daemon.estimation.model.retract import CameraPoints
 def moved(motion: Motion, rates: Rates, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return attitude and position `delay_s` later; delay shape (S,) or (1,)."""
     d = delay_s[:, None]
-    R = motion.R @ so3.exp(rates.omega * d)
+    R = motion.R @ so3.exp(rates.omega * d + (0.5 * d * d) * rates.alpha)
     p = motion.p + motion.v * d + (0.5 * d * d) * rates.accel
     return R, p
 

@@ -8,6 +8,7 @@ import pytest
 from vical_daemon.estimation.filter.linearise import (
     Image,
     LinearityMonitor,
+    bent_by_jitter,
     by_derivatives,
     by_sigma_points,
     project_errors,
@@ -91,6 +92,33 @@ def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     )
     np.testing.assert_allclose(straight.z, points.z, atol=1e-4)
     assert straight.curved.shape == (2 * len(image.points), 0)
+
+
+def test_stamps_that_jitter_move_the_mean_of_the_pixels():
+    """Against the mean over stamps, of a motion that is integrated in small steps."""
+    state, layout, _, image = scene("radtan")
+    rates = Rates(np.array([3.0, -4.0, 2.0]), np.array([20.0, 10.0, -15.0]), np.array([30.0, 20.0, -40.0]))
+    cam, jitter_s = state.cameras["cam0"], 4e-3
+
+    def pixels(late_s):
+        step = (image.t_cam_s + cam.timeshift_s + late_s - state.t_s) / 400
+        R = state.R_world_imu
+        for k in range(400):
+            R = R @ so3.exp(step * (rates.omega + (k + 0.5) * step * rates.alpha))
+        ahead_s = 400 * step
+        p = state.p_world_imu + ahead_s * state.v_world_imu + 0.5 * ahead_s**2 * rates.accel
+        moved = replace(state, t_s=state.t_s + ahead_s, R_world_imu=R, p_world_imu=p)
+        moved.cameras["cam0"] = replace(cam, timeshift_s=moved.t_s - image.t_cam_s)
+        arguments = (moved, layout, rates, "cam0", image.t_cam_s, image.points, None)
+        return project_errors(*arguments, np.zeros((1, layout.size)))[0]
+
+    now, (nodes, weights) = pixels(0.0), np.polynomial.hermite_e.hermegauss(5)
+    mean = sum(w * pixels(jitter_s * x) for x, w in zip(nodes, weights, strict=True)) / weights.sum()
+    state.cameras["cam0"] = cam
+    bent = bent_by_jitter(state, layout, rates, image, jitter_s)
+    assert np.abs(bent).max() > 0.1
+    np.testing.assert_allclose(bent, mean - now, atol=0.02 * np.abs(bent).max())
+    assert bent_by_jitter(state, layout, rates, image, 1e-4) == 0.0
 
 
 def test_rows_of_a_rolling_shutter_put_no_noise_of_the_corners_into_derivatives():
