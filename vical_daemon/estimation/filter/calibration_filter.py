@@ -32,7 +32,7 @@ from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
     LinearityMonitor,
-    bent_by_jitter,
+    bend_by_jitter,
     by_derivatives,
     by_sigma_points,
     is_rolling,
@@ -280,7 +280,7 @@ class CalibrationFilter:
             lin.by_shared = lin.by_error @ shared_ways(self.state, self.layout, image.camera)
             if shared.jitter_s or shared.shift_px:
                 lin.shared = lin.by_shared * shared.sigmas
-            lin.z = lin.z + bent_by_jitter(self.state, self.layout, self.rates, image, shared.jitter_s)
+            bend_by_jitter(lin, self.state, self.layout, self.rates, image, shared.jitter_s)
         return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
@@ -344,7 +344,7 @@ class CalibrationFilter:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
         ways, by_error, by_shared = fit.ways, lin.by_error, lin.by_shared
-        if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
+        if len(by_error) >= self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
             ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep] * fit.noise, 2)[:, None]
             by_shared = by_error @ shared_ways(self.state, self.layout, image.camera)

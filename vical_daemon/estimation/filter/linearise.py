@@ -11,10 +11,12 @@ all rows of an image goes through fourteen columns.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
@@ -137,22 +139,28 @@ def project_errors(
     return project(rows)
 
 
-def bent_by_jitter(
-    state: State, layout: Layout, rates: Rates, image: Image, jitter_s: float
-) -> FloatArray | float:
-    """By how much stamps that jitter move the mean of the pixels, px, shape (n, 2); 0: not by much.
+def bend_by_jitter(
+    lin: Linear, state: State, layout: Layout, rates: Rates, image: Image, jitter_s: float
+) -> None:
+    """Add to mean and covariance what stamps that jitter do to second order, in place; by their sigma points.
 
     A camera does not go on at one rate along a straight line, so an image early and one late do not cancel.
-    By sigma points of the stamp.
     """
     at = layout.cameras[image.camera].timeshift
     if at is None or jitter_s < ANNOUNCED_S:
-        return 0.0
+        return
     errors = np.zeros((3, layout.size))
     errors[1:, at] = jitter_s, -jitter_s
     uv = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
     bent = 0.5 * (uv[1] + uv[2]) - uv[0]
-    return np.where(np.isfinite(bent), bent, 0.0)
+    bent = np.where(lin.valid[:, None] & np.isfinite(bent), bent, 0.0)
+    lin.z = lin.z + bent
+    # one way more, that no error of the state moves: the variance of a square is twice its squared mean
+    lin.ways = np.concatenate([lin.ways, math.sqrt(2.0) * bent.reshape(-1, 1)], axis=1)
+    lin.by_error, lin.spread, lin.by_shared = (
+        np.concatenate([x, np.zeros((1, x.shape[1]))]) for x in (lin.by_error, lin.spread, lin.by_shared)
+    )
+    lin.shared = block_diag(lin.shared, np.ones((1, 1)))
 
 
 def is_rolling(state: State, layout: Layout, camera: str) -> bool:

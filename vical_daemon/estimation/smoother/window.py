@@ -161,7 +161,7 @@ class Window:
     def _biases(self) -> FloatArray:
         """Of gyro and accelerometer at each image, shape (F, 6)."""
         knots = self.knots()
-        return self.bias[np.concatenate([knots[:1], knots])]
+        return np.asarray(self.bias[np.concatenate([knots[:1], knots])])
 
     def imu_by_link(self) -> FloatArray:
         """Bias in force on each link, and numbers of the imu, shape (F - 1, 6 or 22 or 28)."""

@@ -8,7 +8,7 @@ import pytest
 from vical_daemon.estimation.filter.linearise import (
     Image,
     LinearityMonitor,
-    bent_by_jitter,
+    bend_by_jitter,
     by_derivatives,
     by_sigma_points,
     project_errors,
@@ -115,10 +115,19 @@ def test_stamps_that_jitter_move_the_mean_of_the_pixels():
     now, (nodes, weights) = pixels(0.0), np.polynomial.hermite_e.hermegauss(5)
     mean = sum(w * pixels(jitter_s * x) for x, w in zip(nodes, weights, strict=True)) / weights.sum()
     state.cameras["cam0"] = cam
-    bent = bent_by_jitter(state, layout, rates, image, jitter_s)
+    lin = by_derivatives(state, layout, rates, image, np.eye(layout.size))
+    lin.shared, lin.by_shared = lin.shared.copy(), np.zeros((len(lin.by_error), 3))
+    before = replace(lin)
+    bend_by_jitter(lin, state, layout, rates, image, jitter_s)
+    bent = lin.z - before.z
     assert np.abs(bent).max() > 0.1
     np.testing.assert_allclose(bent, mean - now, atol=0.02 * np.abs(bent).max())
-    assert bent_by_jitter(state, layout, rates, image, 1e-4) == 0.0
+    # what is left of an image k jitters late: bent (k^2 - 1), of variance 2 bent^2
+    np.testing.assert_allclose((lin.ways @ lin.shared).ravel() ** 2, 2.0 * bent.ravel() ** 2)
+    np.testing.assert_array_equal(lin.ways @ lin.spread, before.ways @ before.spread)
+    same = replace(before)
+    bend_by_jitter(same, state, layout, rates, image, 1e-4)
+    assert same.z is before.z
 
 
 def test_rows_of_a_rolling_shutter_put_no_noise_of_the_corners_into_derivatives():

@@ -50,7 +50,7 @@ def test_a_gap_ends_a_block():
 
 
 def test_segments_have_what_was_measured_at_the_instants_of_the_means():
-    """A swing of 5 Hz and 5 rad/s loses 5 mrad/s in a mean of 5 ms: one per mille, as an IMU of a wrong scale."""
+    """A swing of 5 Hz and 5 rad/s loses 5 mrad/s in a mean of 5 ms: one per mille, like a wrong scale."""
     intake, turn = ImuIntake(), 10.0 * np.pi
 
     def rate_at(t_s):
