@@ -126,6 +126,7 @@ def _dispatch(words: list[str]) -> int:
         print(help_text(commands), end="", file=sys.stdout if args.help else sys.stderr)
         return 0 if args.help else errors.EXIT_USAGE
     _set_up_logging(args)
+    options.check_outputs(args)
     return int(import_module(commands[args._command].module).run(args))
 
 

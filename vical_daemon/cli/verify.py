@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import ProgressBar, finite
 from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))
-    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
+    recording = open_recording(args.input, cameras=named(args.camera), imus=named(args.imu))
     for warning in recording.warnings:
         print(f"vical: warning: {warning}", file=sys.stderr)
     initial = _initial(args, known, rig)
