@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import os
 import sys
 from pathlib import Path
 from typing import NoReturn
@@ -130,7 +129,7 @@ def check_outputs(args: argparse.Namespace) -> None:
     read = [item for value in values.values() for item in (value if isinstance(value, list) else [value])]
     for path in written:
         for name in (item for item in read if isinstance(item, str | Path)):
-            if path.is_file() and os.path.exists(name) and path.samefile(name):
+            if path.is_file() and Path(name).exists() and path.samefile(name):
                 raise CliError(f"{path} is read by this command, and would be replaced", EXIT_USAGE)
     places = [path.resolve() for path in written if path.is_file() or not path.exists()]
     for place in places:

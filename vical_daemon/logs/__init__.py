@@ -14,7 +14,7 @@ from vical_drivers.user_files import read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.asl import AslRecording
-from vical_daemon.logs.bags import BagRecording
+from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
@@ -96,7 +96,11 @@ def check_recording(
 
     def imu(stream: Stream) -> list[str]:
         name = stream.name
-        return check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
+        samples = recording.imu_arrays(name)
+        found = check_imu(name, samples, recording.set_back_s.get(name, 0.0))
+        if len(recording.imus) > 1 and not samples.gyro_rps.any():  # it takes no other's place
+            raise RecordingError(found[0])
+        return found
 
     fit = _fit(recording, recording.imus, imus, imu)
     readings = list(fit.values())
@@ -157,18 +161,16 @@ def _open(
     if mcap_files(path):
         return McapRecording(path, topics, as_recorded=as_recorded)
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
+        if is_bag(path):
             return BagRecording(path, topics, as_recorded=as_recorded)
         if any(path.glob("*.bag")):
             raise RecordingError(f"{path} holds ROS 1 bags: give the files, {path}/*.bag")
-        if any(path.glob("*.db3")):
-            raise RecordingError(f"{path} lacks the metadata.yaml of a ROS 2 bag: ros2 bag reindex {path}")
         return AslRecording(path, topics, cameras, as_recorded=as_recorded)
     of_a_bag = (path.parent / "metadata.yaml").is_file()
-    if path.suffix == ".bag":
-        return BagRecording(path, topics, as_recorded=as_recorded)
     if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap", ".mcap.zstd", "metadata.yaml")):
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
+    if is_bag(path):
+        return BagRecording(path, topics, as_recorded=as_recorded)
     raise RecordingError(f"{path} {_why_not(path)}")
 
 
@@ -195,10 +197,6 @@ def _why_not(path: Path) -> str:
     """Say why a file is no recording, and what to do."""
     if not path.is_file():
         return "is a pipe or a device: a recording is read more than once, copy it into a file"
-    if path.name.endswith(".bag.active"):
-        return f"was not finished by its recorder: mv {path.name} {path.stem}; rosbag reindex {path.stem}"
     if path.suffix in _UNPACKERS:
         return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
-    if path.suffix == ".db3":
-        return f"lacks its metadata.yaml: ros2 bag reindex {path.parent}"
     return f"is no recording: {_NEEDED}"

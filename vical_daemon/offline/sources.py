@@ -25,9 +25,9 @@ from vical_daemon.bus.messages import (
     merge_calibrations,
 )
 from vical_daemon.bus.topics import parse_key
-from vical_daemon.logs import RecordingError
-from vical_daemon.logs.bags import bag_messages
-from vical_daemon.logs.mcap import LogError, LogReader, segments_in
+from vical_daemon.logs import RecordingError, mcap_files
+from vical_daemon.logs.bags import bag_messages, is_bag
+from vical_daemon.logs.mcap import LogError, LogReader
 from vical_daemon.logs.recorded_logs import RawMessage, name_of_topic
 from vical_daemon.offline.errors import InputError
 
@@ -72,7 +72,7 @@ def read_source(source: str) -> Rig:
         raise InputError(f"{source}: no such file")
     if path.is_dir() and any(path.glob("*.json")) and not any(path.glob("*.mcap")):
         return _from_store(path)
-    if path.is_dir() or path.suffix in (".mcap", ".bag") or path.name.endswith(".mcap.part"):
+    if path.is_dir() or mcap_files(path) or is_bag(path):
         return _from_log(path)
     return read_rig(path)
 
@@ -90,8 +90,8 @@ def _from_log(path: Path) -> Rig:
 
 def _messages(path: Path) -> Iterator[RawMessage]:
     """Yield the messages of a log or bag as CDR; metadata of MCAP files come as messages without a type."""
-    files = segments_in(path) if path.is_dir() else [path]
-    if path.suffix == ".bag" or (not files and (path / "metadata.yaml").is_file()):
+    files = mcap_files(path)
+    if not files and is_bag(path):
         yield from bag_messages(path, _ROS_TYPES)
         return
     for file in files:

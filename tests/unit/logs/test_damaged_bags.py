@@ -1,0 +1,134 @@
+"""Bags as crashes and other programs leave them: cut, without index or metadata, with odd messages."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from vical_daemon.bus.messages import IMU_TYPE, encode_imu
+from vical_daemon.bus.messages.schemas import typestore
+from vical_daemon.logs import RecordingError, open_recording
+
+COUNT = 400
+BEGIN_NS = 1_700_000_000_000_000_000
+
+
+def readings():
+    for i in range(COUNT):
+        stamp = BEGIN_NS + 10_000_000 * i
+        yield stamp, encode_imu(stamp, "imu", (0.1, i / 1000.0, 0.2), (0.0, 0.0, 9.8))
+
+
+@pytest.fixture(params=["NONE", "LZ4", "BZ2"])
+def ros1(tmp_path, request):
+    """A bag with many small chunks, and a topic whose definition nobody can parse."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Ros1Writer(tmp_path / "a.bag")
+    writer.chunk_threshold = 5000
+    if request.param != "NONE":
+        writer.set_compression(Ros1Writer.CompressionFormat[request.param])
+    with writer:
+        topic = writer.add_connection("/imu/data", IMU_TYPE, typestore=store)
+        other = writer.add_connection("/lidar", "some_msgs/msg/Scan", msgdef="Point[] of ! what", md5sum="*")
+        for stamp, payload in readings():
+            writer.write(topic, stamp, bytes(typestore().cdr_to_ros1(payload, IMU_TYPE)))
+            writer.write(other, stamp, bytes(20))
+    return tmp_path / "a.bag"
+
+
+@pytest.fixture
+def ros2(tmp_path):
+    writer = Ros2Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        topic = writer.add_connection("/imu/data", IMU_TYPE, typestore=get_typestore(Stores.ROS2_HUMBLE))
+        for stamp, payload in readings():
+            writer.write(topic, stamp, payload)
+    return tmp_path / "bag"
+
+
+def count(path):
+    recording = open_recording(path, check=False)
+    return recording.imus["imu0"].count, recording.warnings
+
+
+def test_definitions_of_other_packages_do_not_matter(ros1):
+    assert count(ros1) == (COUNT, [])
+
+
+@pytest.mark.parametrize("name", ["cut.bag", "run.bag.active"])
+def test_a_bag_that_was_never_finished_is_read_up_to_its_end(ros1, name):
+    data = ros1.read_bytes()
+    path = ros1.with_name(name)
+    path.write_bytes(data[: len(data) // 2] + bytes(500))  # a file system may leave zeros behind a crash
+    found, warnings = count(path)
+    assert 0.4 * COUNT < found < 0.6 * COUNT
+    assert any(f"{name}: cut off or damaged after" in warning for warning in warnings)
+
+
+def test_a_damaged_chunk_costs_that_chunk(ros1):
+    data = bytearray(ros1.read_bytes())
+    at = data.index(b"compression=") + 300
+    if b"compression=none" in data:
+        pytest.skip("there is nothing to check it by")
+    data[at : at + 64] = bytes(64)
+    ros1.write_bytes(data)
+    found, (warning,) = count(ros1)
+    assert 0.8 * COUNT < found < COUNT
+    assert "1 damaged chunks left out" in warning
+
+
+def test_a_bag_without_its_metadata_is_read(ros2):
+    (ros2 / "metadata.yaml").unlink()
+    assert count(ros2) == count(ros2 / "bag.db3") == (COUNT, [])
+
+
+@pytest.mark.parametrize("name", ["run #2", "50%20", "what?"])
+def test_names_that_mean_something_in_an_address_are_names(ros2, name):
+    assert count(ros2.rename(ros2.with_name(name))) == (COUNT, [])
+
+
+def test_what_a_crash_left_in_the_log_of_sqlite_is_read(ros2, tmp_path):
+    database = sqlite3.connect(ros2 / "bag.db3")
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("DELETE FROM messages WHERE id > 300")
+    database.commit()
+    shutil.copytree(ros2, tmp_path / "crashed")
+    database.close()
+    assert (tmp_path / "crashed/bag.db3-wal").stat().st_size
+    assert count(tmp_path / "crashed") == (300, [])
+
+
+def test_a_file_that_was_not_copied_whole_is_read_as_far_as_it_goes(ros2):
+    path = ros2 / "bag.db3"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    found, (warning,) = count(ros2)
+    assert 0.3 * COUNT < found < 0.6 * COUNT
+    assert f"cut off or damaged behind {found} messages" in warning
+
+
+def test_a_segment_without_messages_or_one_that_is_missing_is_reported(ros2):
+    (ros2 / "bag_1.db3").write_bytes(b"")
+    found, (warning,) = count(ros2)
+    assert found == COUNT and "bag_1.db3 cannot be read" in warning
+    text = (ros2 / "metadata.yaml").read_text()
+    (ros2 / "metadata.yaml").write_text(text.replace("  - bag.db3", "  - bag.db3\n  - bag_1.db3"))
+    (ros2 / "bag_1.db3").unlink()
+    found, (warning,) = count(ros2)
+    assert found == COUNT and "bag_1.db3 of its metadata.yaml is not there" in warning
+
+
+def test_a_view_in_place_of_a_table_is_refused(tmp_path):
+    """It could compute messages without end."""
+    database = sqlite3.connect(tmp_path / "a.db3")
+    database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
+    database.execute("CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, x'00' AS data")
+    database.close()
+    with pytest.raises(RecordingError, match="it has no tables of a ROS 2 bag"):
+        open_recording(tmp_path / "a.db3")
