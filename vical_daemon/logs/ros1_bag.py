@@ -102,7 +102,7 @@ def _message(
     if op == _CONNECTION:
         package, _, name = _fields(bytes(content))[b"type"].decode("utf-8", "replace").rpartition("/")
         topics[fields[b"conn"]] = fields[b"topic"].decode("utf-8", "replace"), f"{package}/msg/{name}"
-    elif op == _MESSAGE:
+    elif op == _MESSAGE and fields[b"conn"] in topics:  # or it was in a damaged chunk
         seconds, nanoseconds = _TIME.unpack(fields[b"time"])
         yield *topics[fields[b"conn"]], seconds * 1_000_000_000 + nanoseconds, content
 
