@@ -31,6 +31,10 @@ class _DamageError(Exception):
     """Here are no records."""
 
 
+_UNREADABLE = (_DamageError, KeyError, IndexError, struct.error, EOFError, RuntimeError)
+"""What damaged records and packed data end with."""
+
+
 def read_ros1_bag(path: Path, budget: Budget, warn: Callable[[str], None]) -> Iterator[Item]:
     """Yield the messages of a bag in the order in which they were recorded.
 
@@ -53,17 +57,15 @@ def read_ros1_bag(path: Path, budget: Budget, warn: Callable[[str], None]) -> It
         while (begin := file.tell()) < size:
             try:
                 fields, content = _next_record(file, size)
-                if fields[b"op"][0] == _CHUNK:
-                    unpacked = _unpacked(fields[b"compression"], content)
-                    budget.spend(len(unpacked))
-                    content = memoryview(unpacked)
-                    yield from _messages(content, topics, budget)
-                else:
-                    yield from _message(fields, content, topics)
-            except (_DamageError, KeyError, IndexError, struct.error):
+            except _UNREADABLE:
                 warn(f"{path.name}: cut off or damaged after {begin / 1e6:.1f} MB; what came before is used")
                 break
-            except (OSError, RuntimeError, EOFError):  # of bz2 and lz4: the records behind it are sound
+            try:
+                if fields[b"op"][0] == _CHUNK:
+                    yield from _messages(_unpacked(fields, content, budget), topics, budget)
+                else:
+                    yield from _message(fields, content, topics)
+            except _UNREADABLE:  # the records behind it are sound
                 spoilt += 1
         if spoilt:
             warn(f"{path.name}: {spoilt} damaged chunks left out")
@@ -127,23 +129,29 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
     return found
 
 
-def _unpacked(compression: bytes, packed: memoryview) -> bytes | memoryview:
+def _unpacked(fields: dict[bytes, bytes], packed: memoryview, budget: Budget) -> memoryview:
     """Unpack a chunk.
 
     Raises:
         ValueError: It is too large, or packed in a way that is not known.
-        OSError, RuntimeError, EOFError: It is damaged.
+        SpentError: All chunks together are too large.
     """
-    if compression == b"none":
-        return packed
-    if compression == b"lz4":
-        return decompress_lz4(packed, CHUNK_LIMIT)
-    if compression != b"bz2":
-        raise ValueError(f"its chunks are packed by {compression.decode('utf-8', 'replace')[:20]!r}")
-    unpacker = bz2.BZ2Decompressor()
-    unpacked = unpacker.decompress(packed, CHUNK_LIMIT)
-    if not unpacker.eof and len(unpacked) >= CHUNK_LIMIT:
+    size: int = _LENGTH.unpack(fields[b"size"])[0]
+    if size > CHUNK_LIMIT:
         raise ValueError(f"a chunk unpacks to more than {CHUNK_LIMIT / 1e6:.0f} MB")
-    if not unpacker.eof:
-        raise EOFError
-    return unpacked
+    compression = fields[b"compression"]
+    if compression == b"none":
+        unpacked = bytes(packed)
+    elif compression == b"lz4":
+        unpacked = decompress_lz4(packed, size + 1)
+    elif compression == b"bz2":
+        try:
+            unpacked = bz2.BZ2Decompressor().decompress(packed, size + 1)
+        except OSError:
+            raise _DamageError from None
+    else:
+        raise ValueError(f"its chunks are packed by {compression.decode('utf-8', 'replace')[:20]!r}")
+    budget.spend(len(unpacked))
+    if len(unpacked) != size:
+        raise _DamageError
+    return memoryview(unpacked)

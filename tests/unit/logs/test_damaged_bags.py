@@ -74,10 +74,10 @@ def test_a_bag_that_was_never_finished_is_read_up_to_its_end(ros1, name):
 
 def test_a_damaged_chunk_costs_that_chunk(ros1):
     data = bytearray(ros1.read_bytes())
-    at = data.index(b"compression=", len(data) // 2) + 300
-    if b"compression=none" in data:
+    begins = [data.find(magic, len(data) // 2) for magic in (b"\x04\x22\x4d\x18", b"BZh9")]  # lz4, bz2
+    if max(begins) < 0:
         pytest.skip("there is nothing to check it by")
-    data[at : at + 64] = bytes(64)
+    data[max(begins) : max(begins) + 64] = bytes(64)
     ros1.write_bytes(data)
     found, (warning,) = count(ros1)
     assert 0.8 * COUNT < found < COUNT

@@ -88,7 +88,7 @@ def test_each_chunk_of_a_ros1_bag_is_unpacked_once(tmp_path, monkeypatch, kind):
     unpacked = []
     unpack = ros1_bag._unpacked
     monkeypatch.setattr(
-        ros1_bag, "_unpacked", lambda how, data: unpacked.append(bytes(data)) or unpack(how, data)
+        ros1_bag, "_unpacked", lambda x, data, all_: unpacked.append(bytes(data)) or unpack(x, data, all_)
     )
     found = [message.log_time_ns for message in bags.bag_messages(tmp_path / "a.bag", ())]
     assert found == [10_000_000 * i + 1 for i in times] and len(found) == 400
