@@ -153,7 +153,7 @@ def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray, str]:
-    from vical_daemon.logs import open_recording
+    from vical_daemon.logs import meant, open_recording
 
     recording = open_recording(path, check=False)
     names = list(recording.imus)
@@ -161,7 +161,7 @@ def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, 
         raise CliError(f"{path} holds no IMU data")
     if imu is None and len(names) > 1:
         raise CliError(f"{path} holds the imus {', '.join(names)}; choose one with --imu", EXIT_USAGE)
-    chosen = imu or names[0]
+    chosen = meant(recording.imus, imu) if imu else names[0]
     if chosen not in names:
         raise CliError(f"{path} holds no imu {chosen!r}, only {', '.join(names)}", EXIT_USAGE)
     arrays = recording.imu_arrays(chosen)

@@ -17,7 +17,7 @@ from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
-from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
+from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "Stream",
     "check_recording",
     "mcap_files",
+    "meant",
     "open_recording",
 ]
 
@@ -119,7 +120,7 @@ def check_recording(
 def _fit(
     recording: Recording,
     sensors: dict[str, Stream],
-    meant: Collection[str],
+    names: Collection[str],
     check: Callable[[Stream], list[str]],
 ) -> dict[str, Stream]:
     """Return the sensors of one kind that can be used, of those that are meant (none of them there: all).
@@ -127,7 +128,8 @@ def _fit(
     Raises:
         RecordingError: One that is meant is not fit, or of all none is.
     """
-    named = [name for name in sensors if name in meant]
+    wanted = {meant(sensors, name) for name in names}
+    named = [name for name in sensors if name in wanted]
     unfit: dict[str, RecordingError] = {}
     for name in named or sensors:
         try:

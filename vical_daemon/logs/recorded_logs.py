@@ -309,7 +309,10 @@ class LogRecording(Recording):
     def _stream(self, topic: str, channel: Channel) -> Stream:
         stamps = np.sort(channel.t_ns())
         statistics = stream_statistics(stamps)
-        return Stream(channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution)
+        of_images = topic.split(" ")[0] if channel.kind in ("image", "compressed") else ""
+        return Stream(
+            channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution, topic=of_images
+        )
 
     def _nothing(self) -> str:
         wanted = "sensor_msgs/Imu with Image, CompressedImage or vical_msgs points"
@@ -367,9 +370,9 @@ def _with_frame(topic: str, frame: bytes) -> str:
 
 
 def _shows_depth(raw: RawMessage) -> bool:
-    """Whether an image holds distances: `compressedDepth`, or 16UC1 or 32FC1 (REP 118) on such a topic.
+    """Whether an image holds distances: `compressedDepth`, or 16 bit or 32FC1 (REP 118) on such a topic.
 
-    Thermal cameras send 16UC1, too.
+    Thermal cameras send 16UC1, too. (mono16: bags of the RealSense viewer.)
     """
     try:
         if raw.type_name == COMPRESSED_IMAGE_TYPE:
@@ -377,7 +380,7 @@ def _shows_depth(raw: RawMessage) -> bool:
         encoding = decode_image(raw.payload).encoding
     except MessageError:
         return False
-    return encoding in ("16UC1", "32FC1") and "depth" in raw.topic.lower()
+    return encoding in ("16UC1", "mono16", "32FC1") and "depth" in raw.topic.lower()
 
 
 class McapRecording(LogRecording):

@@ -24,11 +24,11 @@ from vical_daemon.bus.messages import (
     decode_transforms,
     merge_calibrations,
 )
-from vical_daemon.bus.topics import parse_key
 from vical_daemon.logs import RecordingError, mcap_files
 from vical_daemon.logs.bags import bag_messages, is_bag
 from vical_daemon.logs.mcap import LogError, LogReader
-from vical_daemon.logs.recorded_logs import RawMessage, name_of_topic
+from vical_daemon.logs.recorded_logs import RawMessage
+from vical_daemon.offline.camera_names import camera_name
 from vical_daemon.offline.errors import InputError
 
 if TYPE_CHECKING:
@@ -152,17 +152,12 @@ class _Found:
             frame = next(iter(self.parents)) if len(self.parents) == 1 else rig.imu_frame
             return replace(rig, devices=self.devices, imu_frame=frame)
         if self.infos or self.transforms:
-            lenses = {_camera_name(topic): info for topic, info in self.infos.items()}
+            lenses = {camera_name(topic): info for topic, info in self.infos.items()}
             return rig_from_ros(lenses, self.transforms, sorted(self.imu_frames), str(path))
         raise InputError(
             f"{path}: no calibration in this log, and no CameraInfo with static transforms; run "
             f"`vical calibrate {path} --target FILE -o result.json` and give result.json"
         )
-
-
-def _camera_name(topic: str) -> str:
-    parsed = parse_key(topic.strip("/"))
-    return name_of_topic(topic, "cam") if parsed is None else parsed.name
 
 
 def _from_store(folder: Path) -> Rig:
