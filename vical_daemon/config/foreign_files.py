@@ -33,7 +33,7 @@ _FOR_PRIORS = (  # read elsewhere, but not as prior values
         "give the kalibr_imucam_chain.yaml that it names",
     ),
     (
-        r"(imus|cameras)\s*:\s*\n\s+\w+\s*:",
+        r"(imus|cameras)\s*:",
         "a config of vical",
         "prior values have sections like `cam0: {{intrinsics: [...]}}`",
     ),

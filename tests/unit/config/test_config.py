@@ -279,6 +279,12 @@ class TestInitial:
             ("image_width: 752\ncamera_matrix:\n  rows: 3\n", "a file of ROS; .* Kalibr's form"),
             ("sensor_type: camera\nT_BS: {cols: 4}\n", "EuRoC's sensor.yaml"),
             ("target_type: aprilgrid\ntagCols: 6\n", "a target file; give it with --target"),
+            (
+                '%YAML:1.0\nuse_fej: true\nrelative_config_imucam: "a.yaml"\n',
+                r"OpenVINS's .* give the kalibr_imu",
+            ),
+            ("%YAML:1.0\ncameras:\n     - {T_SC:\n        [1, 0]}\n", "a camera file of OKVIS or maplab"),
+            ("label: rig\ncameras:\n- camera:\n    label: c\n", "a camera file of OKVIS or maplab"),
             ("rig: rover\ncameras: {cam0: {uri: x}}\n", "a config of vical; .*`cam0: {intrinsics"),
         ],
     )
