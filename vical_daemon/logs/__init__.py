@@ -19,6 +19,7 @@ from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
+from vical_daemon.logs.what_is_there import FROM_VIDEO, VIDEOS, what_is_there
 
 __all__ = [
     "LEFT_OUT",
@@ -91,9 +92,10 @@ def check_recording(
         RecordingError: A value is implausible, or imu or camera are missing.
     """
     if not recording.imus:
-        raise RecordingError(
-            f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
-        )
+        sources = ", ".join(s.source for s in recording.streams)
+        there = what_is_there(recording.path)
+        expected = "; imu0.csv or imu0/data.csv is expected" if there else ""
+        raise RecordingError(f"{recording.path} holds no IMU data: found only {sources}{expected}{there}")
 
     def imu(stream: Stream) -> list[str]:
         name = stream.name
@@ -199,6 +201,8 @@ def _why_not(path: Path) -> str:
     """Say why a file is no recording, and what to do."""
     if not path.is_file():
         return "is a pipe or a device: a recording is read more than once, copy it into a file"
+    if path.suffix.lower() in VIDEOS:
+        return f"is no recording: {FROM_VIDEO}, with imu0.csv next to it"
     if path.suffix in _UNPACKERS:
         return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
     return f"is no recording: {_NEEDED}"

@@ -39,6 +39,7 @@ from vical_daemon.logs.model import (
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers, set_back_s
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
+from vical_daemon.logs.what_is_there import images_in, what_is_there
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -120,8 +121,10 @@ class AslRecording(Recording):
             raise RecordingError(
                 f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
                 "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz], or "
-                "Kalibr's imu0.csv and cam0/ with images named by their stamps, ns"
+                f"Kalibr's imu0.csv and cam0/ with images named by their stamps, ns{what_is_there(root)}"
             )
+        if not folders and names is None and (found := images_in(root)):
+            self.warnings.append(f"no cameras: their folders must be cam0, cam1 ...; found {found}")
 
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`."""

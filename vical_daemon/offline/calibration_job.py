@@ -121,7 +121,8 @@ def make_job(
         stream = _choose("camera", recording.cameras, camera)
         chosen = {stream.name: stream}
     if not chosen:
-        unread = "; ".join(w for w in recording.warnings if "unreadable" in w or "no stamps" in w)
+        reasons = ("unreadable", "no stamps", "no cameras")
+        unread = "; ".join(w for w in recording.warnings if any(reason in w for reason in reasons))
         why = f" ({unread})" if unread else "; `vical info` shows what is in it"
         raise InputError(f"{recording.path} holds no camera, neither images nor points{why}")
     cameras = priors_meant(initial, chosen)

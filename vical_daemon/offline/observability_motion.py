@@ -52,6 +52,8 @@ def motion_of(
         InputError: No imu, no motion to work with, or no calibration without a board.
     """
     recording = open_recording(path, cameras=[camera] if camera else (), check=False)
+    for warning in recording.warnings:
+        warn(warning)
     cameras = recording.cameras
     name = meant(cameras, camera) if camera else next(iter(cameras), None)
     if name is None or name not in cameras or (camera is None and len(cameras) > 1):
