@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import TypeVar
 
@@ -27,13 +28,14 @@ def by_recording(
 
     Args:
         said: By the names in the file.
-        topics: Topic of the images, by the names in the file; not of all.
+        topics: Topic of the images, by the names in the file; not of all. One that two cameras have is none.
         names: Names in the recording.
     """
-    named = {name: camera_name(topics[name]) if topics.get(name) else "" for name in said}
-    found = {named[name]: item for name, item in said.items() if named[name] in names}
-    rest = {name: item for name, item in said.items() if named[name] not in names}
-    return rest | found
+    meant = {name: camera_name(topics[name]) for name in said if topics.get(name)}
+    once = Counter(meant.values())
+    renamed = {old: new for old, new in meant.items() if new in names and once[new] == 1}
+    rest = {name: item for name, item in said.items() if name not in renamed}
+    return rest | {new: said[old] for old, new in renamed.items()}
 
 
 def priors_meant(initial: Initial, names: Collection[str]) -> dict[str, CameraPrior]:

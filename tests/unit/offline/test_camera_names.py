@@ -62,6 +62,8 @@ def test_topics_of_another_robot_do_not_matter(tmp_path):
 def test_a_topic_has_precedence_over_a_name():
     said = by_recording({"cam1": 1, "cam0": 2}, {"cam0": "/cam1/image_raw"}, ["cam0", "cam1"])
     assert said == {"cam1": 2}
+    copied = dict.fromkeys(["cam0", "cam1"], "/cam0/image_raw")
+    assert by_recording({"cam0": 1, "cam1": 2}, copied, ["cam0", "cam1"]) == {"cam0": 1, "cam1": 2}
 
 
 def test_sections_may_have_the_names_of_the_recording(tmp_path):
