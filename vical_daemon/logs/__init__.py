@@ -93,9 +93,11 @@ def check_recording(
     """
     if not recording.imus:
         sources = ", ".join(s.source for s in recording.streams)
+        unread = "".join(f"; {text}" for text in recording.warnings if "unreadable" in text)
         there = what_is_there(recording.path)
         expected = "; imu0.csv or imu0/data.csv is expected" if there else ""
-        raise RecordingError(f"{recording.path} holds no IMU data: found only {sources}{expected}{there}")
+        found = f"found only {sources}{unread}{expected}{there}"
+        raise RecordingError(f"{recording.path} holds no IMU data: {found}")
 
     def imu(stream: Stream) -> list[str]:
         name = stream.name
@@ -175,6 +177,8 @@ def _open(
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
     if is_bag(path):
         return BagRecording(path, topics, as_recorded=as_recorded)
+    if path.is_file() and path.name.endswith((".csv", ".csv.gz")):
+        return AslRecording(path, topics, as_recorded=as_recorded)
     raise RecordingError(f"{path} {_why_not(path)}")
 
 

@@ -85,7 +85,7 @@ class AslRecording(Recording):
         """Parse the tables (images are read later, one by one).
 
         Args:
-            folder: With `mav0`, or that itself.
+            folder: With `mav0`, or that itself; or a table of inertial readings.
             names: Imus and cameras to read; None: all. Files of others are not read.
             cameras: Of the cameras only these, if the folder has one of them.
             as_recorded: Leave the stamps alone.
@@ -102,7 +102,7 @@ class AslRecording(Recording):
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         self._sources: list[_Source] = []
-        imus = imu_tables(root)
+        imus = {"imu0": folder} if folder.is_file() else imu_tables(root)
         for name, table in imus.items():
             if names is None or name in names:
                 self._sources.append(self._read_imu(table, name))
@@ -147,10 +147,11 @@ class AslRecording(Recording):
 
     def _read_imu(self, path: Path, name: str) -> _Source:
         rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
-        finite = np.isfinite(rows["values"]).all(axis=1)
+        finite = np.isfinite(rows["values"]).all(axis=1) & rows["values"].any(axis=1)
         rows = self._even(rows[finite], name)
         if not finite.all():
-            self.warnings.append(f"{name}: {int((~finite).sum())} samples that are not finite left out")
+            text = f"{int((~finite).sum())} samples that are not finite, or all 0, left out"
+            self.warnings.append(f"{name}: {text}")
         gyro = np.ascontiguousarray(rows["values"][:, :3])
         force = np.ascontiguousarray(rows["values"][:, 3:])
         t_ns = np.ascontiguousarray(rows["t"])

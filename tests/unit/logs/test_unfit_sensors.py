@@ -9,6 +9,7 @@ from mcap.writer import Writer
 from vical_daemon.bus.messages import IMAGE_TYPE, IMU_TYPE, encode_image, encode_imu
 from vical_daemon.cli import main
 from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.mcap import LogWriter
 
 PIXELS = np.zeros((24, 32), np.uint8)
 
@@ -79,3 +80,26 @@ def test_where_none_is_fit_the_first_is_named(write):
         open_recording(write({"livox": 0.1, "ouster": 0.1}, {"cam0": (10, 0)}))
     with pytest.raises(RecordingError, match=r"slow: 0\.25 frames a second"):
         open_recording(write({"imu": 1.0}, {"slow": (800, 0)}))
+
+
+def test_readings_that_are_all_0_are_no_readings(tmp_path, a_motion, write_asl):
+    """A bus that does not answer; and an imu of orientations alone is none."""
+    t_ns, gyro, force = a_motion()
+    nothing = (0.0, 0.0, 0.0)
+    gyro[::50], force[::50] = 0.0, 0.0
+    left = len(t_ns) - len(t_ns[::50])
+    recording = open_recording(write_asl(tmp_path / "asl", imu=(t_ns, gyro, force)))
+    assert recording.imus["imu0"].count == left
+    assert any("48 samples that are not finite, or all 0, left out" in w for w in recording.warnings)
+    log = tmp_path / "b.mcap"
+    with LogWriter(log) as writer:
+        for t, w, f in zip(t_ns.tolist(), gyro.tolist(), force.tolist(), strict=True):
+            writer.write("vical/rig0/imu/imu0", encode_imu(t, "imu0", w, f), t)
+            writer.write("vical/rig0/imu/poses", encode_imu(t, "poses", nothing, nothing), t)
+        for t in t_ns[::10].tolist():
+            writer.write("vical/rig0/camera/cam0/image", encode_image(t, "cam0", PIXELS, "mono8"), t)
+    recording = open_recording(log)
+    assert list(recording.imus) == ["imu0"] and recording.imus["imu0"].count == left
+    assert sum("unreadable messages left out (all readings are 0)" in w for w in recording.warnings) == 2
+    keys = [key for key, _ in recording.messages(recording.imus.values())]
+    assert len(keys) == left == len(recording.imu_arrays("imu0").t_ns)
