@@ -11,20 +11,12 @@ from typing import Any
 
 from vical_drivers.user_files import open_file, read_text
 
-from vical_daemon.bus.messages import (
-    COMPRESSED_IMAGE_TYPE,
-    IMAGE_TYPE,
-    IMU_TYPE,
-    POINTS_TYPE,
-    TRACKS_TYPE,
-)
-from vical_daemon.bus.messages.schemas import typestore
 from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.db3 import read_db3
 from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget
 from vical_daemon.logs.model import RecordingError
-from vical_daemon.logs.recorded_logs import LogRecording, RawMessage
-from vical_daemon.logs.ros1_bag import read_ros1_bag
+from vical_daemon.logs.recorded_logs import SENSOR_TYPES, LogRecording, RawMessage
+from vical_daemon.logs.ros1_bag import read_ros1_bag, to_cdr
 
 PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?(message|file)", re.IGNORECASE | re.MULTILINE)
 _LISTED = re.compile(r"^\s*- (\S+\.db3)\s*$", re.MULTILINE)
@@ -58,7 +50,7 @@ def bag_messages(
         budget = Budget(_checked_size(path))
         if path.is_file() and path.suffix != ".db3":
             for topic, type_name, time_ns, data in read_ros1_bag(path, budget, warn):
-                yield RawMessage(topic, type_name, time_ns, _to_cdr(data, type_name, types))
+                yield RawMessage(topic, type_name, time_ns, to_cdr(data, type_name, types))
         elif path.is_file() or (plain := _plain_files(path, warn)):
             for item in read_db3([path] if path.is_file() else plain, warn):
                 yield RawMessage(*item)
@@ -153,14 +145,4 @@ class BagRecording(LogRecording):
     """A bag of ROS 1 or ROS 2, see `is_bag`."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        return bag_messages(self.path, _WANTED, _nowhere if self._scanned else self.warnings.append)
-
-
-_WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
-
-
-def _to_cdr(data: memoryview, type_name: str, types: Collection[str]) -> bytes:
-    """Return a ROS 1 message as CDR (its header loses `seq`); None for types that are not used."""
-    if type_name not in types:
-        return b""
-    return bytes(typestore().ros1_to_cdr(bytes(data), type_name))
+        return bag_messages(self.path, SENSOR_TYPES, _nowhere if self._scanned else self.warnings.append)

@@ -8,12 +8,13 @@ from __future__ import annotations
 import bz2
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from vical_drivers.user_files import open_file
 
+from vical_daemon.bus.messages.schemas import typestore
 from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget, decompress_lz4
 
 _MAGIC = b"#ROSBAG V2.0\n"
@@ -25,6 +26,26 @@ _HEADER_LIMIT = 2**20  # bytes; a header holds names and numbers
 
 Item = tuple[str, str, int, memoryview]
 """Topic, type as in ROS 2, time at which it was recorded (ns), and the message."""
+
+
+def ros2_type(type_name: str) -> str:
+    """Return the name in ROS 2 of a type of ROS 1.
+
+    >>> ros2_type("sensor_msgs/Imu")
+    'sensor_msgs/msg/Imu'
+    """
+    package, _, name = type_name.rpartition("/")
+    return f"{package}/msg/{name}"
+
+
+def to_cdr(data: bytes | memoryview, type_name: str, types: Collection[str]) -> bytes:
+    """Return a ROS 1 message as CDR (its header loses `seq`); empty if damaged, or of no type wanted."""
+    if type_name not in types:
+        return b""
+    try:
+        return bytes(typestore().ros1_to_cdr(bytes(data), type_name))
+    except Exception:  # rosbags raises whatever its parsers raise on damaged messages
+        return b""
 
 
 class _DamageError(Exception):
@@ -102,8 +123,8 @@ def _message(
     """Yield the message of a record, if it holds one; note the topic of a connection."""
     op = fields[b"op"][0]
     if op == _CONNECTION:
-        package, _, name = _fields(bytes(content))[b"type"].decode("utf-8", "replace").rpartition("/")
-        topics[fields[b"conn"]] = fields[b"topic"].decode("utf-8", "replace"), f"{package}/msg/{name}"
+        type_name = _fields(bytes(content))[b"type"].decode("utf-8", "replace")
+        topics[fields[b"conn"]] = fields[b"topic"].decode("utf-8", "replace"), ros2_type(type_name)
     elif op == _MESSAGE and fields[b"conn"] in topics:  # or it was in a damaged chunk
         seconds, nanoseconds = _TIME.unpack(fields[b"time"])
         yield *topics[fields[b"conn"]], seconds * 1_000_000_000 + nanoseconds, content

@@ -27,7 +27,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.logs import RecordingError, mcap_files
 from vical_daemon.logs.bags import bag_messages, is_bag
 from vical_daemon.logs.mcap import LogError, LogReader
-from vical_daemon.logs.recorded_logs import RawMessage
+from vical_daemon.logs.recorded_logs import RawMessage, as_cdr
 from vical_daemon.offline.camera_names import camera_name
 from vical_daemon.offline.errors import InputError
 
@@ -97,8 +97,8 @@ def _messages(path: Path) -> Iterator[RawMessage]:
     for file in files:
         reader = LogReader(file)
         for m in reader.messages():
-            if m.channel.encoding == "cdr":
-                yield RawMessage(m.channel.topic, m.channel.type_name, m.log_time_ns, m.payload)
+            if (raw := as_cdr(m, _ROS_TYPES)) is not None:
+                yield raw
         for name, values in reader.metadata:
             yield RawMessage(name, "", 0, json.dumps(values).encode())
 

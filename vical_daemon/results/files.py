@@ -96,7 +96,7 @@ def _read_yaml(path: Path) -> str:
     except OSError as error:
         raise ExportError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise ExportError(f"{path}: not a text file") from None
+        raise ExportError(f"{path}: not a text file in UTF-8") from None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import sqlite3
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -133,3 +134,20 @@ def test_a_view_in_place_of_a_table_is_refused(tmp_path):
     database.close()
     with pytest.raises(RecordingError, match="it has no tables of a ROS 2 bag"):
         open_recording(tmp_path / "a.db3")
+
+
+@pytest.mark.parametrize("damaged", [0, 3])
+def test_a_bag_of_ros_1_converted_to_mcap_is_read(tmp_path, damaged):
+    """`mcap convert a.bag a.mcap` keeps the messages as they are."""
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros1")
+        schema = writer.register_schema("sensor_msgs/Imu", "ros1msg", b"")
+        topic = writer.register_channel("/imu/data", "ros1", schema)
+        for number, (stamp, payload) in enumerate(readings()):
+            data = bytes(typestore().cdr_to_ros1(payload, IMU_TYPE))
+            writer.add_message(topic, stamp, data[: 50 if number < damaged else None], stamp)
+        writer.finish()
+    found, warnings = count(tmp_path / "a.mcap")
+    assert found == COUNT - damaged
+    assert [f"{damaged} unreadable messages left out" in w for w in warnings] == [True] * bool(damaged)

@@ -98,21 +98,18 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
     from vical_daemon.logs import mcap_files
     from vical_daemon.logs.bags import bag_messages, is_bag
     from vical_daemon.logs.mcap import LogError, LogReader
+    from vical_daemon.logs.recorded_logs import as_cdr
 
     store, files = typestore(), mcap_files(path)
     if not files and not is_bag(path):
         raise InputError(f"{path} is no log of messages: topics need an MCAP or a bag")
+    logged = (as_cdr(m, _POSE_TYPES) for file in files for m in LogReader(file).messages())
     try:
-        for file in files:
-            for m in LogReader(file).messages():
-                channel = m.channel
-                if channel.encoding == "cdr":
-                    data, kind = m.payload, channel.type_name
-                    yield channel.topic, kind, lambda d=data, k=kind: store.deserialize_cdr(d, k)
+        for raw in logged if files else bag_messages(path, _POSE_TYPES):
+            if raw is not None:
+                yield raw.topic, raw.type_name, lambda r=raw: store.deserialize_cdr(r.payload, r.type_name)
     except LogError as error:
         raise InputError(str(error)) from None
-    for raw in () if files else bag_messages(path, _POSE_TYPES):
-        yield raw.topic, raw.type_name, lambda r=raw: store.deserialize_cdr(r.payload, r.type_name)
 
 
 def trajectory_file(path: Path, base_ns: int | None, warn: Warn = ignore) -> tuple[OrientationStream, int]:
