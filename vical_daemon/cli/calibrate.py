@@ -190,10 +190,12 @@ def conclude(
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
-        from vical_daemon.offline.calibration_job import suspects
+        from vical_daemon.offline.calibration_job import one_alone, suspects
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = outcome.wrong_target or diagnose_input(job)
+        if mistake:
+            mistake += one_alone(job)
         why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")

@@ -293,6 +293,13 @@ def suspects(job: Job) -> str:
     things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
     if job.config.target:
         things.insert(0, f"the sizes in {job.config.target}")
-    waits = "; all wait for a camera that hardly sees the target: --camera NAME takes one of them alone"
-    check = f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
-    return check + (waits if job.config.target and len(job.cameras) > 1 else "")
+    return (
+        f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}{one_alone(job)}"
+    )
+
+
+def one_alone(job: Job) -> str:
+    """What to try where one of several cameras may hold up the others; empty: it cannot be that."""
+    if not job.config.target or len(job.cameras) == 1:
+        return ""
+    return "; all wait for a camera that hardly sees the target: --camera NAME takes one of them alone"

@@ -309,6 +309,8 @@ class TestInitial:
                 "cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}",
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5; the model with these is plumb_bob",
             ),
+            ("cam0: {T_cam_imu: [1, 0, 0, 0]}", r"T_cam_imu.0: expected a list like"),
+            (f"cam0: {{T_cam_imu: {[0] * 16}}}", r"T_cam_imu: expected 4 rows like \[a, b\], found 16"),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
             ("cam0: {camera_model: fisheye}", "is not pinhole"),
             (
