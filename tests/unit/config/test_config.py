@@ -310,7 +310,10 @@ class TestInitial:
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5; the model with these is plumb_bob",
             ),
             ("cam0: {T_cam_imu: [1, 0, 0, 0]}", r"T_cam_imu.0: expected a list like"),
-            (f"cam0: {{T_cam_imu: {[0] * 16}}}", r"T_cam_imu: expected 4 rows like \[a, b\], found 16"),
+            (
+                f"cam0: {{T_cam_imu: {[0] * 16}}}",
+                r"T_cam_imu: expected 4 values, found 16: each must be a list like",
+            ),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
             ("cam0: {camera_model: fisheye}", "is not pinhole"),
             (
