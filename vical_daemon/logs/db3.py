@@ -66,7 +66,8 @@ def _opened(path: Path) -> sqlite3.Connection:
     # As it is, without locks and a log of changes, unless there is a log: that holds what a crash left.
     waiting = path.with_name(f"{path.name}-wal")
     unfinished = waiting.is_file() and waiting.stat().st_size > 0
-    database = sqlite3.connect(f"{address}?{'mode=ro' if unfinished else 'immutable=1'}", uri=True)
+    how = "mode=ro" if unfinished else "immutable=1"
+    database = sqlite3.connect(f"{address}?{how}", uri=True, check_same_thread=False)  # played by a thread
     try:
         database.execute("PRAGMA trusted_schema=OFF")
         database.execute("PRAGMA writable_schema=ON")  # or a file that is cut off is refused as a whole

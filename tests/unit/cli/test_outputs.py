@@ -21,6 +21,14 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     return found
 
 
+def test_recordings_may_stand_on_both_sides_of_an_option(files, capsys) -> None:
+    (files["log.mcap"].parent / "other.mcap").write_text(TARGET)
+    assert main(["calibrate", "log.mcap", "--target", "target.yaml", "./log.mcap"]) == 2
+    assert "./log.mcap is given twice" in capsys.readouterr().err
+    assert main(["info", "log.mcap", "--json", "other.mcap"]) == 1
+    assert capsys.readouterr().err.count("error:") == 2
+
+
 @pytest.mark.parametrize(
     "words",
     [
