@@ -52,7 +52,7 @@ def bag_messages(
             for topic, type_name, time_ns, data in read_ros1_bag(path, budget, warn):
                 yield RawMessage(topic, type_name, time_ns, to_cdr(data, type_name, types))
         elif path.is_file() or (plain := _plain_files(path, warn)):
-            for item in read_db3([path] if path.is_file() else plain, warn):
+            for item in read_db3([path] if path.is_file() else plain, budget, warn):
                 yield RawMessage(*item)
         else:
             yield from _packed(path, budget)

@@ -9,21 +9,25 @@ from pathlib import Path
 
 from vical_drivers.user_files import open_file
 
+from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget
+
 Item = tuple[str, str, int, bytes]
 """Topic, type, time at which it was recorded (ns), and the message."""
 _TOPICS = "SELECT id, name, type FROM topics"
 _MESSAGES = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
 
 
-def read_db3(paths: list[Path], warn: Callable[[str], None]) -> Iterator[Item]:
+def read_db3(paths: list[Path], budget: Budget, warn: Callable[[str], None]) -> Iterator[Item]:
     """Yield the messages of the files of one bag in the order in which they were recorded.
 
     Args:
         paths: The files.
+        budget: Limits what comes out of them: a column may be computed.
         warn: Takes what is damaged, one line each.
 
     Raises:
         ValueError: None of them can be read; the message completes a sentence.
+        SpentError: They hold more than files of their size can.
         OSError: One is no regular file.
     """
     begun, refused = [], []
@@ -40,6 +44,7 @@ def read_db3(paths: list[Path], warn: Callable[[str], None]) -> Iterator[Item]:
         count = 0
         try:
             for row in _rows(path):
+                budget.spend(len(row[3]))
                 yield row
                 count += 1
         except sqlite3.Error as error:
@@ -69,6 +74,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     how = "mode=ro" if unfinished else "immutable=1"
     database = sqlite3.connect(f"{address}?{how}", uri=True, check_same_thread=False)  # played by a thread
     try:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, CHUNK_LIMIT)
         database.execute("PRAGMA trusted_schema=OFF")
         database.execute("PRAGMA writable_schema=ON")  # or a file that is cut off is refused as a whole
         kinds = dict(database.execute("SELECT name, type FROM sqlite_master").fetchall())

@@ -151,3 +151,21 @@ def test_a_bag_of_ros_1_converted_to_mcap_is_read(tmp_path, damaged):
     found, warnings = count(tmp_path / "a.mcap")
     assert found == COUNT - damaged
     assert [f"{damaged} unreadable messages left out" in w for w in warnings] == [True] * bool(damaged)
+
+
+@pytest.mark.parametrize(
+    ("length", "says"), [(10**9, "string or blob too big"), (10**8, "were unpacked from a")]
+)
+def test_a_column_that_is_computed_is_bounded(tmp_path, length, says):
+    database = sqlite3.connect(tmp_path / "a.db3")
+    database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
+    database.execute("INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu')")
+    column = f"data BLOB GENERATED ALWAYS AS (zeroblob({length}))"
+    database.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp INTEGER, {column})")
+    database.executemany(
+        "INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)", [(i,) for i in range(100)]
+    )
+    database.commit()
+    database.close()
+    with pytest.raises(RecordingError, match=says):
+        open_recording(tmp_path / "a.db3")
