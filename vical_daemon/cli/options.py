@@ -114,8 +114,12 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="target file of the board, Kalibr's format (default: calibrate without a board)",
     )
-    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    parser.add_argument(
+        "--camera", metavar="NAME", help="use only this camera, by name or topic (default: all)"
+    )
+    parser.add_argument(
+        "--imu", metavar="NAME", help="which IMU, by name or topic, if the recording has several"
+    )
 
 
 def check_outputs(args: argparse.Namespace) -> None:
