@@ -36,6 +36,9 @@ Exit code: 0 done, 1 a known failure (one line on stderr), 2 wrong usage or conf
 4 `verify`, `compare`: changed, 5 `verify`: cannot tell, `compare`: not comparable.
 """
 
+_SEVERAL = ("inputs", "logs", "sources")
+"""Arguments of which a command takes any number."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line (the console script `vical`).
@@ -112,6 +115,10 @@ def _dispatch(words: list[str]) -> int:
         hint = f": {meant}" if meant else options.suggest(selected, list(commands))
         raise errors.CliError(f"{selected!r} is not a command{hint} (see `vical --help`)", errors.EXIT_USAGE)
     args, more = parser.parse_known_args(words)
+    several = next((value for name in _SEVERAL if isinstance(value := getattr(args, name, None), list)), None)
+    if several is not None and not any(word.startswith("-") for word in more):
+        several += more  # those behind an option, which argparse leaves over
+        more = []
     if more:
         near = _nearest_option(parser, selected, more[0])
         help_of = " ".join(filter(None, ["vical", selected]))
@@ -126,6 +133,7 @@ def _dispatch(words: list[str]) -> int:
         print(help_text(commands), end="", file=sys.stdout if args.help else sys.stderr)
         return 0 if args.help else errors.EXIT_USAGE
     _set_up_logging(args)
+    options.check_outputs(args)
     return int(import_module(commands[args._command].module).run(args))
 
 

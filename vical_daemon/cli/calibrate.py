@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch, suggest, warn
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named, suggest, warn
 from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
@@ -143,7 +143,8 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
-    recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
+    cameras, imus = named(args.camera), named(args.imu)
+    recordings = [open_recording(path, cameras=cameras, imus=imus) for path in args.inputs]
     for warning in (text for recording in recordings for text in recording.warnings):
         warn(warning)
     job = make_job(
@@ -189,10 +190,12 @@ def conclude(
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
-        from vical_daemon.offline.calibration_job import suspects
+        from vical_daemon.offline.calibration_job import one_alone, suspects
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = outcome.wrong_target or diagnose_input(job)
+        if mistake:
+            mistake += one_alone(job)
         why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from vical_drivers.user_files import read_text
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.imu_options import COLUMNS
+from vical_daemon.cli.options import warn
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl_tables import TABLE_LIMIT
-from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 _LIVELY = 5.0  # scatter of the gyro within a second over that of the quietest ones
@@ -57,7 +52,7 @@ def load(args: argparse.Namespace) -> EvenSamples:
     path = Path(args.input)
     if args.skip < 0 or (args.seconds is not None and args.seconds <= 0):
         raise CliError("--skip must be 0 or more and --seconds above 0", EXIT_USAGE)
-    t_ns, gyro, accel, name = _read_csv(path) if path.suffix == ".csv" else _read_recording(path, args.imu)
+    t_ns, gyro, accel, name = _read(path, args.imu)
     use = t_ns >= t_ns[0] + int(args.skip * 1e9)
     if args.seconds is not None:
         use &= t_ns < t_ns[0] + int((args.skip + args.seconds) * 1e9)
@@ -152,52 +147,19 @@ def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) ->
     return EvenSamples(name, rate_hz, gyro, accel, filled)
 
 
-def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray, str]:
-    from vical_daemon.logs import open_recording
+def _read(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray, str]:
+    from vical_daemon.logs import meant, open_recording
 
     recording = open_recording(path, check=False)
+    for warning in recording.warnings:
+        warn(warning)
     names = list(recording.imus)
     if not names:
         raise CliError(f"{path} holds no IMU data")
     if imu is None and len(names) > 1:
         raise CliError(f"{path} holds the imus {', '.join(names)}; choose one with --imu", EXIT_USAGE)
-    chosen = imu or names[0]
+    chosen = meant(recording.imus, imu) if imu else names[0]
     if chosen not in names:
         raise CliError(f"{path} holds no imu {chosen!r}, only {', '.join(names)}", EXIT_USAGE)
     arrays = recording.imu_arrays(chosen)
     return arrays.t_ns, arrays.gyro_rps, arrays.specific_force_mps2, f"{path}: {chosen}"
-
-
-def _read_csv(path: Path) -> tuple[IntArray, FloatArray, FloatArray, str]:
-    try:
-        text = read_text(path, TABLE_LIMIT)
-        title = text[: text.find("\n")]
-        if degrees_named(title):
-            raise CliError(f"{path}: {IN_DEGREES}")
-        named = columns_by_title(title)
-        if named is not None and not named.in_order:
-            text = reordered(text.encode(), named).decode()
-        first = next(csv.reader(io.StringIO(text)), [])
-        if not first:
-            raise CliError(f"{path}: is empty")
-        skip = int(not _is_number(first[0]))
-        table = np.loadtxt(
-            io.StringIO(text), delimiter=",", skiprows=skip, usecols=range(1, 7), ndmin=2, comments="#"
-        )
-        stamps = np.loadtxt(
-            io.StringIO(text), delimiter=",", skiprows=skip, usecols=0, ndmin=1, comments="#", dtype=np.int64
-        )
-    except (ValueError, IndexError, UnicodeDecodeError, csv.Error) as error:
-        reason = " ".join(str(error).split())
-        raise CliError(f"{path}: cannot be read as {COLUMNS}: {reason[:200]}") from error
-    if not np.all(np.isfinite(table)) or len(stamps) < 100:
-        raise CliError(f"{path}: needs at least 100 lines of finite numbers: {COLUMNS}")
-    return stamps, table[:, :3], table[:, 3:], str(path)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -54,24 +54,26 @@ def run(args: argparse.Namespace) -> int:
 
 def _summarise(path: Path) -> tuple[Summary, str]:
     """Return what a recording holds, and why `vical calibrate` would not take it (empty: it would)."""
-    from vical_daemon.logs import RecordingError, check_recording, mcap_files, open_recording
+    from vical_daemon.logs import LEFT_OUT, RecordingError, check_recording, mcap_files, open_recording
     from vical_daemon.logs.summary import summarise_logs, summarise_recording
 
     problem = ""
     files = mcap_files(path)
-    if files and path.exists():
-        summary = summarise_logs(path, files)
-        try:
-            check_recording(open_recording(path, check=False))
-        except RecordingError as error:
-            problem = str(error)
-        return summary, problem
-    recording = open_recording(path, check=False, as_recorded=True)
+    summary = summarise_logs(path, files) if files and path.exists() else None
+    recording = None
     try:
+        recording = open_recording(path, check=False, as_recorded=summary is None)
         check_recording(recording)
     except RecordingError as error:
+        if summary is None and recording is None:
+            raise
         problem = str(error)
-    return summarise_recording(recording), problem
+    if summary is None:
+        assert recording is not None
+        return summarise_recording(recording), problem
+    found = recording.warnings if recording is not None else []
+    summary.warnings.extend(warning for warning in found if warning.startswith(LEFT_OUT))
+    return summary, problem
 
 
 def _as_json(summary: Summary, problem: str) -> dict[str, object]:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import difflib
 import sys
+from pathlib import Path
 from typing import NoReturn
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
+
+_WRITTEN = ("output", "out", "report", "yaml")
+"""Options, of all commands, that name a file to write."""
 
 
 class VicalParser(argparse.ArgumentParser):
@@ -110,8 +114,36 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="target file of the board, Kalibr's format (default: calibrate without a board)",
     )
-    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    parser.add_argument(
+        "--camera", metavar="NAME", help="use only this camera, by name or topic (default: all)"
+    )
+    parser.add_argument(
+        "--imu", metavar="NAME", help="which IMU, by name or topic, if the recording has several"
+    )
+
+
+def check_outputs(args: argparse.Namespace) -> None:
+    """Refuse to write onto a file that the command reads, or two outputs into one file.
+
+    Raises:
+        CliError: One is.
+    """
+    values = {name: value for name, value in vars(args).items() if value}
+    written = [Path(values.pop(name)) for name in _WRITTEN if isinstance(values.get(name), str | Path)]
+    read = [item for value in values.values() for item in (value if isinstance(value, list) else [value])]
+    for path in written:
+        for name in (item for item in read if isinstance(item, str | Path)):
+            if path.is_file() and Path(name).exists() and path.samefile(name):
+                raise CliError(f"{path} is read by this command, and would be replaced", EXIT_USAGE)
+    places = [path.resolve() for path in written if path.is_file() or not path.exists()]
+    for place in places:
+        if places.count(place) > 1:
+            raise CliError(f"{place}: two outputs cannot be written to one file", EXIT_USAGE)
+
+
+def named(name: str | None) -> tuple[str, ...]:
+    """Return the sensors that an option names: one, or none."""
+    return (name,) if name else ()
 
 
 def add_stretch(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import ProgressBar, finite
 from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
@@ -89,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
     from vical_daemon.logs import open_recording
     from vical_daemon.offline.calibrate import run_job
     from vical_daemon.offline.calibration_job import make_job
+    from vical_daemon.offline.camera_names import by_recording
     from vical_daemon.offline.sources import read_known
 
     known, rig = read_known(args.against)
@@ -98,9 +99,11 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))
-    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
+    recording = open_recording(args.input, cameras=named(args.camera), imus=named(args.imu))
     for warning in recording.warnings:
         print(f"vical: warning: {warning}", file=sys.stderr)
+    topics = {name: camera.topic for name, camera in known.items()}
+    known = by_recording(known, topics, recording.cameras)
     initial = _initial(args, known, rig)
     held = args.fix == "intrinsics" or any(camera.lens is None for camera in known.values())
     job = make_job(
@@ -164,7 +167,7 @@ def _initial(args: argparse.Namespace, known: dict[str, KnownCamera], rig: Rig |
         if camera.lens is None:
             continue
         fx, fy, cx, cy, *distortion = (float(x) for x in camera.lens)
-        readout_s = rig.cameras[name].readout_s if rig is not None else 0.0
+        readout_s = rig.cameras[camera.name].readout_s if rig is not None else 0.0
         cameras[name] = CameraPrior(
             camera.resolution or (0, 0),
             (fx, fy, cx, cy),
@@ -175,7 +178,9 @@ def _initial(args: argparse.Namespace, known: dict[str, KnownCamera], rig: Rig |
     lacking = [name for name in known if name not in cameras and len(cameras) != 1]
     if lacking:
         raise CliError(f"{args.against} has no lens of {lacking[0]}; give it with --initial", EXIT_USAGE)
-    return Initial(cameras, given.imu_noise or (rig.noise if rig is not None else None), given.imu_rate_hz)
+    noise = given.imu_noise or (rig.noise if rig is not None else None)
+    topics = {name: topic for name, topic in given.topics.items() if name not in known}
+    return Initial(cameras, noise, given.imu_rate_hz, topics)
 
 
 def _counts(args: argparse.Namespace) -> Counts:

@@ -21,11 +21,17 @@ _FORMATS = (  # mark at the start of a line (or JSON key), what it is, what to d
     (r"(Camera\d?\.(type|fx)|File\.version)\s*:", "ORB-SLAM3's settings", _COPY),
     (r"(sensor_type|T_BS)\s*:", "EuRoC's sensor.yaml", f"{_COPY}; T_cam_imu is the inverse of T_BS"),
     (r"\d+ [A-Z_]*(PINHOLE|RADIAL|OPENCV|FISHEYE|FOV)[A-Z_]* \d+ \d+ ", "COLMAP's cameras.txt", _COPY),
+    (r"cameras\s*:\s*\n\s*-", "a camera file of OKVIS or maplab", _COPY),
     (r".*<robot\b", "a URDF", _COPY),
     (r"Calibration results\s*$", "Kalibr's report", "give the camchain-imucam.yaml that was written with it"),
 )
 _FOR_PRIORS = (  # read elsewhere, but not as prior values
     (r"target_type\s*:", "a target file", "give it with --target"),
+    (
+        r"relative_config_imucam\s*:",
+        "OpenVINS's estimator_config.yaml",
+        "give the kalibr_imucam_chain.yaml that it names",
+    ),
     (
         r"(imus|cameras)\s*:",
         "a config of vical",

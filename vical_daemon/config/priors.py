@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -73,6 +73,7 @@ class _KalibrImu:
     time_offset: float | None = None
 
 
+_CAMERA_KEYS = {f.name for f in fields(_KalibrCamera)} - {f.name for f in fields(_KalibrImu)}
 _OTHER_LENSES = ("omni", "eucm", "ds")
 """Camera models of Kalibr that we lack."""
 _RESULTS_OF_IMU = (
@@ -90,11 +91,20 @@ class Initial:
         cameras: Prior by camera name; resolution (0, 0) if the file does not give it.
         imu_noise: None if the file has no IMU keys.
         imu_rate_hz: None if the file does not give it.
+        topics: `rostopic` by camera name, where it is given.
     """
 
     cameras: dict[str, CameraPrior] = field(default_factory=dict)
     imu_noise: ImuNoise | None = None
     imu_rate_hz: float | None = None
+    topics: dict[str, str] = field(default_factory=dict)
+
+
+def is_camera(name: str, section: Value) -> bool:
+    """Whether a section is a camera: cam0, or of any other name with keys that only cameras have."""
+    return name.startswith("cam") or (
+        not name.startswith("imu") and isinstance(section, dict) and not _CAMERA_KEYS.isdisjoint(section)
+    )
 
 
 def read_initial(path: Path | str) -> Initial:
@@ -119,6 +129,7 @@ def priors_in(document: Document) -> Initial:
     """
     cameras: dict[str, CameraPrior] = {}
     steps: dict[str, Matrix4] = {}
+    topics: dict[str, str] = {}
     imu: _KalibrImu | None = None
     sections = [document.root, *(value for value in document.root.values() if isinstance(value, dict))]
     for section in sections:
@@ -129,22 +140,25 @@ def priors_in(document: Document) -> Initial:
     }
     if loose:  # Kalibr's own imu.yaml has its keys at the top level
         imu = schema.build(Document(document.name, loose, document.lines), _KalibrImu)
-    for name in document.root:
+    for name, content in document.root.items():
         if name in loose:
             continue
-        if name.startswith("cam"):
+        if is_camera(name, content):
             _refuse_other_lenses(document, name)
             camera = schema.build(document, _KalibrCamera, name)
             cameras[name] = _camera_prior(document, name, camera)
+            if camera.rostopic:
+                topics[name] = camera.rostopic
             if camera.T_cn_cnm1:
                 steps[name] = camera.T_cn_cnm1
         elif name.startswith("imu"):
             imu = imu or schema.build(document, _KalibrImu, name)
         else:
             raise ConfigError(
-                f"{name}: unknown section; expected cam0, cam1 ... or imu0 ({document.where(name)})"
+                f"{name}: unknown section; expected cameras (cam0, cam1 ...) or imu0 ({document.where(name)})"
             )
-    return Initial(_along_the_chain(cameras, steps), *(_noise(imu) if imu is not None else (None, None)))
+    noise, rate_hz = _noise(imu) if imu is not None else (None, None)
+    return Initial(_along_the_chain(cameras, steps), noise, rate_hz, topics)
 
 
 def camera_prior(config: Config, name: str) -> CameraPrior:

@@ -81,7 +81,7 @@ def read(path: Path) -> Document:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file") from None
+        raise ConfigError(f"{path}: not a text file in UTF-8") from None
     return parse(text, path.name)
 
 

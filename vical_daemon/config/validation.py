@@ -140,7 +140,8 @@ def _convert_list(
     else:
         kinds = list(arguments)
         if len(value) != len(kinds):
-            raise _MistakeError(path, f"expected {len(kinds)} values, found {len(value)}")
+            rows = ": each must be a list like [a, b]" if get_origin(kinds[0]) is tuple else ""
+            raise _MistakeError(path, f"expected {len(kinds)} values, found {len(value)}{rows}")
     return tuple(
         _build(v, k, f"{path}.{i}", document, problems)
         for i, (v, k) in enumerate(zip(value, kinds, strict=True))

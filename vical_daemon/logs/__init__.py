@@ -7,20 +7,22 @@ ROS 1 bag or an ASL/EuRoC folder, checks that units and rates can be right, and 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vical_drivers.user_files import read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.asl import AslRecording
-from vical_daemon.logs.bags import BagRecording
+from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
-from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
+from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
+from vical_daemon.logs.what_is_there import FROM_VIDEO, VIDEOS, what_is_there
 
 __all__ = [
+    "LEFT_OUT",
     "ImuArrays",
     "Kind",
     "Recording",
@@ -28,8 +30,12 @@ __all__ = [
     "Stream",
     "check_recording",
     "mcap_files",
+    "meant",
     "open_recording",
 ]
+
+LEFT_OUT = "left out, another is used:"
+"""How the warning of a sensor begins that is not fit, see `check_recording`."""
 
 
 def open_recording(
@@ -37,6 +43,7 @@ def open_recording(
     *,
     topics: Collection[str] | None = None,
     cameras: Collection[str] = (),
+    imus: Collection[str] = (),
     check: bool = True,
     as_recorded: bool = False,
 ) -> Recording:
@@ -45,11 +52,13 @@ def open_recording(
     Args:
         path: File or folder.
         topics: Topics, or names of imus and cameras, to take; None: all that can be used.
-        cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
-            others may be as broken as they like.
+        cameras: Of the cameras only these, where there is one of them: what belongs to others may be as
+            broken as it likes.
+        imus: The same for imus.
         as_recorded: Leave the stamps alone. Otherwise readings and images that were stamped on arrival are
             put on the even grid of their device (`even_stamps`, `even_images`), with a warning.
-        check: Refuse wrong units, rates and clocks (`check_recording`).
+        check: Refuse wrong units, rates and clocks, and leave out sensors that are not meant
+            (`check_recording`).
 
     Raises:
         RecordingError: It cannot be used; the message is one line with a remedy.
@@ -61,34 +70,80 @@ def open_recording(
         raise RecordingError(f"{path} does not exist; check the path")
     recording = _open(path, topics, cameras, as_recorded)
     if check:
-        check_recording(recording)
+        recording.streams = check_recording(recording, cameras, imus)
     return recording
 
 
-def check_recording(recording: Recording) -> None:
+def check_recording(
+    recording: Recording, cameras: Collection[str] = (), imus: Collection[str] = ()
+) -> tuple[Stream, ...]:
     """Check units, rates and overlap; adds to `recording.warnings`.
+
+    Args:
+        recording: What to check.
+        cameras: Those that are meant, where there is one of them; otherwise all.
+        imus: The same for imus.
+
+    Returns:
+        The streams to use: those that are meant. Of all, those that are not fit are left out with a warning
+        (a laser scanner's imu in g, next to another one).
 
     Raises:
         RecordingError: A value is implausible, or imu or camera are missing.
     """
     if not recording.imus:
-        raise RecordingError(
-            f"{recording.path} holds no IMU data: found only {', '.join(s.source for s in recording.streams)}"
-        )
-    for name in recording.imus:
-        recording.warnings.extend(
-            check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
-        )
-    for name, stream in recording.cameras.items():
-        recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
-        if stream.kind in ("image", "compressed"):
-            others = [
-                s for s in recording.streams if s.name == name and s not in (stream, recording.imus.get(name))
-            ]
-            recording.warnings.extend(
-                f"{name}: {stream.source} is used ({stream.count} images), not {s.source} ({s.count})"
-                for s in others
+        sources = ", ".join(s.source for s in recording.streams)
+        unread = "".join(f"; {text}" for text in recording.warnings if "unreadable" in text)
+        there = what_is_there(recording.path)
+        expected = "; imu0.csv or imu0/data.csv is expected" if there else ""
+        found = f"found only {sources}{unread}{expected}{there}"
+        raise RecordingError(f"{recording.path} holds no IMU data: {found}")
+
+    def imu(stream: Stream) -> list[str]:
+        name = stream.name
+        samples = recording.imu_arrays(name)
+        found = check_imu(name, samples, recording.set_back_s.get(name, 0.0))
+        if len(recording.imus) > 1 and not samples.gyro_rps.any():  # it takes no other's place
+            raise RecordingError(found[0])
+        return found
+
+    fit = _fit(recording, recording.imus, imus, imu)
+    readings = list(fit.values())
+    shown = _fit(recording, recording.cameras, cameras, lambda stream: check_camera(stream, readings))
+    of_cameras = [s for s in recording.streams if s.kind != "imu" and s.name in shown]
+    for other in of_cameras:
+        stream = shown[other.name]
+        if stream.kind in ("image", "compressed") and other != stream:
+            recording.warnings.append(
+                f"{other.name}: {stream.source} is used ({stream.count} images), not {other.source} "
+                f"({other.count})"
             )
+    return (*readings, *of_cameras)
+
+
+def _fit(
+    recording: Recording,
+    sensors: dict[str, Stream],
+    names: Collection[str],
+    check: Callable[[Stream], list[str]],
+) -> dict[str, Stream]:
+    """Return the sensors of one kind that can be used, of those that are meant (none of them there: all).
+
+    Raises:
+        RecordingError: One that is meant is not fit, or of all none is.
+    """
+    wanted = {meant(sensors, name) for name in names}
+    named = [name for name in sensors if name in wanted]
+    unfit: dict[str, RecordingError] = {}
+    for name in named or sensors:
+        try:
+            recording.warnings.extend(check(sensors[name]))
+        except RecordingError as error:
+            unfit[name] = error
+    if unfit and (named or len(unfit) == len(sensors)):
+        raise next(iter(unfit.values()))
+    recording.warnings.extend(f"{LEFT_OUT} {error}" for error in unfit.values())
+    return {name: sensors[name] for name in named or sensors if name not in unfit}
 
 
 _NEEDED = "expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder (with mav0/imu0/data.csv)"
@@ -112,18 +167,18 @@ def _open(
     if mcap_files(path):
         return McapRecording(path, topics, as_recorded=as_recorded)
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
+        if is_bag(path):
             return BagRecording(path, topics, as_recorded=as_recorded)
         if any(path.glob("*.bag")):
             raise RecordingError(f"{path} holds ROS 1 bags: give the files, {path}/*.bag")
-        if any(path.glob("*.db3")):
-            raise RecordingError(f"{path} lacks the metadata.yaml of a ROS 2 bag: ros2 bag reindex {path}")
         return AslRecording(path, topics, cameras, as_recorded=as_recorded)
     of_a_bag = (path.parent / "metadata.yaml").is_file()
-    if path.suffix == ".bag":
-        return BagRecording(path, topics, as_recorded=as_recorded)
     if of_a_bag and path.name.endswith((".db3", ".db3.zstd", ".mcap", ".mcap.zstd", "metadata.yaml")):
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
+    if is_bag(path):
+        return BagRecording(path, topics, as_recorded=as_recorded)
+    if path.is_file() and path.name.endswith((".csv", ".csv.gz")):
+        return AslRecording(path, topics, as_recorded=as_recorded)
     raise RecordingError(f"{path} {_why_not(path)}")
 
 
@@ -150,10 +205,8 @@ def _why_not(path: Path) -> str:
     """Say why a file is no recording, and what to do."""
     if not path.is_file():
         return "is a pipe or a device: a recording is read more than once, copy it into a file"
-    if path.name.endswith(".bag.active"):
-        return f"was not finished by its recorder: mv {path.name} {path.stem}; rosbag reindex {path.stem}"
+    if path.suffix.lower() in VIDEOS:
+        return f"is no recording: {FROM_VIDEO}, with imu0.csv next to it"
     if path.suffix in _UNPACKERS:
         return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
-    if path.suffix == ".db3":
-        return f"lacks its metadata.yaml: ros2 bag reindex {path.parent}"
     return f"is no recording: {_NEEDED}"

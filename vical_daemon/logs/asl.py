@@ -39,6 +39,7 @@ from vical_daemon.logs.model import (
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers, set_back_s
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
+from vical_daemon.logs.what_is_there import images_in, what_is_there
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -84,7 +85,7 @@ class AslRecording(Recording):
         """Parse the tables (images are read later, one by one).
 
         Args:
-            folder: With `mav0`, or that itself.
+            folder: With `mav0`, or that itself; or a table of inertial readings.
             names: Imus and cameras to read; None: all. Files of others are not read.
             cameras: Of the cameras only these, if the folder has one of them.
             as_recorded: Leave the stamps alone.
@@ -101,7 +102,7 @@ class AslRecording(Recording):
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         self._sources: list[_Source] = []
-        imus = imu_tables(root)
+        imus = {"imu0": folder} if folder.is_file() else imu_tables(root)
         for name, table in imus.items():
             if names is None or name in names:
                 self._sources.append(self._read_imu(table, name))
@@ -120,8 +121,10 @@ class AslRecording(Recording):
             raise RecordingError(
                 f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
                 "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz], or "
-                "Kalibr's imu0.csv and cam0/ with images named by their stamps, ns"
+                f"Kalibr's imu0.csv and cam0/ with images named by their stamps, ns{what_is_there(root)}"
             )
+        if not folders and names is None and (found := images_in(root)):
+            self.warnings.append(f"no cameras: their folders must be cam0, cam1 ...; found {found}")
 
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`."""
@@ -144,10 +147,11 @@ class AslRecording(Recording):
 
     def _read_imu(self, path: Path, name: str) -> _Source:
         rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
-        finite = np.isfinite(rows["values"]).all(axis=1)
+        finite = np.isfinite(rows["values"]).all(axis=1) & rows["values"].any(axis=1)
         rows = self._even(rows[finite], name)
         if not finite.all():
-            self.warnings.append(f"{name}: {int((~finite).sum())} samples that are not finite left out")
+            text = f"{int((~finite).sum())} samples that are not finite, or all 0, left out"
+            self.warnings.append(f"{name}: {text}")
         gyro = np.ascontiguousarray(rows["values"][:, :3])
         force = np.ascontiguousarray(rows["values"][:, 3:])
         t_ns = np.ascontiguousarray(rows["t"])

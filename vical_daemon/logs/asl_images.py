@@ -135,7 +135,15 @@ def _is_stamp(name: str) -> bool:
 
 
 def image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the size of the images from ``sensor.yaml`` or the first image that has one."""
+    """Return the size of the first image that has one; where there are none, that in ``sensor.yaml``.
+
+    Images may have been made smaller, or the file copied from another camera.
+    """
+    for path in _in_order(folder, set(IMAGE_SUFFIXES))[:_TRIED]:
+        with open_file(path) as file:
+            found = encoded_size(file.read(HEAD))
+        if found is not None:
+            return found
     sensor = folder / "sensor.yaml"
     if sensor.is_file():
         import yaml
@@ -147,9 +155,4 @@ def image_size(folder: Path) -> tuple[int, int] | None:
             return int(size[0]), int(size[1])
         except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
             pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
-    for path in _in_order(folder, set(IMAGE_SUFFIXES))[:_TRIED]:
-        with open_file(path) as file:
-            found = encoded_size(file.read(HEAD))
-        if found is not None:
-            return found
     return None

@@ -1,63 +1,93 @@
-"""Reads ROS 1 bags and ROS 2 bag folders through rosbags; every message comes out as ROS 2 CDR."""
+"""Reads bags of ROS 1 and ROS 2; every message comes out as ROS 2 CDR. rosbags reads packed ones of ROS 2."""
 
 from __future__ import annotations
 
-import bz2
 import io
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vical_drivers.user_files import open_file
+from vical_drivers.user_files import open_file, read_text
 
-from vical_daemon.bus.messages import (
-    COMPRESSED_IMAGE_TYPE,
-    IMAGE_TYPE,
-    IMU_TYPE,
-    POINTS_TYPE,
-    TRACKS_TYPE,
-)
-from vical_daemon.bus.messages.schemas import typestore
 from vical_daemon.config.strict_yaml import MAX_BYTES
-from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget, decompress_lz4
+from vical_daemon.logs.db3 import read_db3
+from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget
 from vical_daemon.logs.model import RecordingError
-from vical_daemon.logs.recorded_logs import LogRecording, RawMessage
+from vical_daemon.logs.recorded_logs import SENSOR_TYPES, LogRecording, RawMessage
+from vical_daemon.logs.ros1_bag import read_ros1_bag, to_cdr
 
-_ROS1 = b"#ROSBAG V2.0\n"  # wiki.ros.org/Bags/Format/2.0
-_RECENT_BYTES = 32 * 2**20  # 40 chunks of the usual 768 kB
+PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?(message|file)", re.IGNORECASE | re.MULTILINE)
+_LISTED = re.compile(r"^\s*- (\S+\.db3)\s*$", re.MULTILINE)
 
 
-@contextmanager
-def open_bag(path: Path) -> Iterator[Any]:
-    """Open a bag with rosbags; turns its errors into one line.
+def _nowhere(line: str) -> None:
+    """Take a warning, and do nothing."""
+
+
+def is_bag(path: Path) -> bool:
+    """Whether this is what `bag_messages` reads: a file of ROS 1, or a folder or a ``.db3`` file of ROS 2."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or any(path.glob("*.db3"))
+    return path.is_file() and path.name.endswith((".bag", ".bag.active", ".db3"))
+
+
+def bag_messages(
+    path: Path, types: Collection[str], warn: Callable[[str], None] = _nowhere
+) -> Iterator[RawMessage]:
+    """Yield all messages of a bag, of ROS 1 those of some types as CDR, and others empty.
 
     Args:
-        path: A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2.
-
-    Returns:
-        A rosbags `AnyReader`.
+        path: See `is_bag`.
+        types: Of which the content is wanted.
+        warn: Takes what is damaged, one line each.
 
     Raises:
         RecordingError: It cannot be read.
     """
-    from rosbags.highlevel import AnyReader
-
     try:
-        with (
-            _bounded(Budget(_checked_size(path))),
-            AnyReader([path], default_typestore=None if path.suffix == ".bag" else typestore()) as reader,
-        ):
-            yield reader
+        budget = Budget(_checked_size(path))
+        if path.is_file() and path.suffix != ".db3":
+            for topic, type_name, time_ns, data in read_ros1_bag(path, budget, warn):
+                yield RawMessage(topic, type_name, time_ns, to_cdr(data, type_name, types))
+        elif path.is_file() or (plain := _plain_files(path, warn)):
+            for item in read_db3([path] if path.is_file() else plain, budget, warn):
+                yield RawMessage(*item)
+        else:
+            yield from _packed(path, budget)
     except (RecordingError, GeneratorExit):
         raise
     except OSError as error:
         raise RecordingError(f"{error.filename or path}: {error.strerror or error}") from None
     except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
         first = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        raise RecordingError(
-            f"{path} cannot be read as a bag: {first[:200]}; try rosbag reindex or ros2 bag reindex"
-        ) from None
+        raise RecordingError(f"{path} cannot be read as a bag: {first[:200]}") from None
+
+
+def _plain_files(folder: Path, warn: Callable[[str], None]) -> list[Path]:
+    """Return the ``.db3`` files of a bag of ROS 2 whose messages are not packed."""
+    files = sorted(folder.glob("*.db3"))
+    try:
+        text = read_text(folder / "metadata.yaml", MAX_BYTES)
+    except (OSError, UnicodeDecodeError):
+        return files
+    if PACKED.search(text):
+        return []
+    names = {Path(name).name for name in _LISTED.findall(text)}
+    missing = sorted(names - {file.name for file in files}) if len(names) != len(files) else []
+    if files and missing:
+        warn(f"{folder}: {', '.join(missing)} of its metadata.yaml is not there")
+    return files
+
+
+def _packed(folder: Path, budget: Budget) -> Iterator[RawMessage]:
+    """Yield the messages of a bag of ROS 2 that is packed."""
+    from rosbags.rosbag2 import Reader
+
+    with _bounded(budget), Reader(folder) as reader:
+        for connection, time_ns, data in reader.messages():
+            yield RawMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
 
 
 def _checked_size(path: Path) -> int:
@@ -66,10 +96,6 @@ def _checked_size(path: Path) -> int:
     for member in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not member.is_dir():
             with open_file(member, MAX_BYTES if member.name == "metadata.yaml" else None) as file:
-                if member.suffix == ".bag" and file.read(len(_ROS1)) != _ROS1:
-                    raise RecordingError(
-                        f"{member} cannot be read as a bag: it does not begin like one of ROS 1, version 2.0"
-                    )
                 size += file.seek(0, io.SEEK_END)
     return size
 
@@ -77,54 +103,19 @@ def _checked_size(path: Path) -> int:
 @contextmanager
 def _bounded(budget: Budget) -> Iterator[None]:
     """Replace the unpacking functions of rosbags, which have no limit, while a bag is open."""
-    from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
 
-    unpackers, zstd = dict(ros1.decompressors), ros2.zstd
-    ros1.decompressors["bz2"] = _RecentChunks(budget, _decompress_bz2)
-    ros1.decompressors["lz4"] = _RecentChunks(
-        budget, lambda data: decompress_lz4(memoryview(data), CHUNK_LIMIT)
-    )
+    zstd = ros2.zstd
     ros2.zstd = _Zstd(zstd, budget)
     try:
         yield
     finally:
-        ros1.decompressors.update(unpackers)
         ros2.zstd = zstd
-
-
-def _decompress_bz2(data: bytes) -> bytes:
-    unpacker = bz2.BZ2Decompressor()
-    unpacked = unpacker.decompress(data, CHUNK_LIMIT)
-    if not unpacker.eof:
-        raise ValueError(f"a chunk is cut off or unpacks to more than {CHUNK_LIMIT / 1e6:.0f} MB")
-    return unpacked
 
 
 def _spend(budget: Budget, data: bytes) -> bytes:
     budget.spend(len(data))
     return data
-
-
-class _RecentChunks:
-    """Unpacks chunks of ROS 1; keeps the last ones, because rosbags reads by time and keeps only one.
-
-    A recorder writes messages as they arrive, so at a chunk's end their times alternate between two chunks
-    (of streams with other delays: among several).
-    """
-
-    def __init__(self, budget: Budget, unpack: Callable[[bytes], bytes]) -> None:
-        self._budget, self._unpack = budget, unpack
-        self._chunks: dict[bytes, bytes] = {}  # packed -> unpacked, the last used at the end
-
-    def __call__(self, packed: bytes) -> bytes:
-        data = self._chunks.pop(packed, None)
-        if data is None:
-            data = _spend(self._budget, self._unpack(packed))
-        self._chunks[packed] = data
-        while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > _RECENT_BYTES:
-            del self._chunks[next(iter(self._chunks))]
-        return data
 
 
 class _Zstd:
@@ -150,30 +141,8 @@ class _Zstd:
         return _spend(self._budget, unpacked)
 
 
-def bag_messages(path: Path, types: Collection[str]) -> Iterator[RawMessage]:
-    """Yield all messages of a bag, see `open_bag`; of ROS 1 those of some types as CDR, and others empty.
-
-    Raises:
-        RecordingError: It cannot be read.
-    """
-    with open_bag(path) as reader:
-        for connection, log_time_ns, data in reader.messages():
-            payload = bytes(data) if reader.is2 else _to_cdr(data, connection.msgtype, types)
-            yield RawMessage(connection.topic, connection.msgtype, log_time_ns, payload)
-
-
 class BagRecording(LogRecording):
-    """A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2."""
+    """A bag of ROS 1 or ROS 2, see `is_bag`."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        return bag_messages(self.path, _WANTED)
-
-
-_WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
-
-
-def _to_cdr(data: bytes, type_name: str, types: Collection[str]) -> bytes:
-    """Return a ROS 1 message as CDR (its header loses `seq`); None for types that are not used."""
-    if type_name not in types:
-        return b""
-    return bytes(typestore().ros1_to_cdr(data, type_name))
+        return bag_messages(self.path, SENSOR_TYPES, _nowhere if self._scanned else self.warnings.append)

@@ -28,6 +28,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"  # RFC 8878
 # Offsets of rates and forces from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
 _IMU_NUMBERS = 37 * 8
+_ZEROS = bytes(24)
 _IN_TURNS = 10
 """Changes of the frame_id from which on devices take turns; a driver that is started anew makes one."""
 
@@ -86,11 +87,12 @@ class Channel:
     @property
     def as_it_is(self) -> bool:
         """Whether all messages with a stamp are used, with that stamp and these readings."""
-        return self.even_ns is None and self.forces is None and not self.unread_first and not self.strays
+        changed = self.even_ns is not None or self.forces is not None
+        return not (changed or self.unreadable or self.strays)
 
     def stamp_of(self, payload: bytes) -> int | None:
         """Return the stamp of a message of this topic; None if it is damaged."""
-        return None if self.kind == "imu" and not _has_imu_size(payload) else stamp_of(payload)
+        return None if self.kind == "imu" and not _holds_readings(payload) else stamp_of(payload)
 
     def take(self, payload: bytes, log_time_ns: int) -> int | None:
         """Take the next message of the log; its stamp, None if it is not readable."""
@@ -98,6 +100,8 @@ class Channel:
         if stamp_ns is None or (not self.stamps and not self._readable(payload)):
             self.unreadable += 1
             self.unread_first += stamp_ns is not None
+            if self.kind == "imu" and _is_zero(payload):
+                self.problem = "all readings are 0"
             if payload.startswith(_ZSTD):
                 self.problem = "each is packed by zstd: give the bag with its metadata.yaml"
             return None
@@ -137,7 +141,6 @@ class Channel:
                 self,
                 stamps=array("q", stamps[mine].tolist()),
                 values=bytearray(rows[mine].tobytes()),
-                unreadable=0,
                 unread_first=0,
             )
         return of_each
@@ -255,8 +258,15 @@ def with_force(payload: bytes, force: bytes) -> bytes:
     return payload[: _FORCE.start] + force + payload[_FORCE.stop :]
 
 
-def _has_imu_size(payload: bytes) -> bool:
-    """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
+def _is_zero(payload: bytes) -> bool:
+    """Whether all six readings are 0: a device that did not answer, or a sender of orientations alone."""
+    return payload[_GYRO] == _ZEROS == payload[_FORCE]
+
+
+def _holds_readings(payload: bytes) -> bool:
+    """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is, with readings."""
+    if _is_zero(payload):
+        return False
     if len(payload) < 16 + _IMU_NUMBERS:
         return False
     behind_name = 12 + int.from_bytes(payload[12:16], "little")  # counted from behind the encapsulation

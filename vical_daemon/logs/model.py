@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush, merge
 from pathlib import Path
@@ -56,6 +56,7 @@ class Stream:
         largest_gap_s: Longest interval.
         resolution: width, height, px, of a camera; None where the recording does not say.
         extent_px: How far points lie to the right and below, px (99 % of them); zeros: not known.
+        topic: Of images in a log; "": there is none.
     """
 
     key: str
@@ -69,6 +70,7 @@ class Stream:
     largest_gap_s: float
     resolution: tuple[int, int] | None = None
     extent_px: tuple[float, float] = (0.0, 0.0)
+    topic: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -172,6 +174,16 @@ class Recording(ABC):
         """
         for _, payload in self._messages({self.cameras[camera].key}):
             yield decode_points(payload).to_frame()
+
+
+def meant(streams: Mapping[str, Stream], name: str) -> str:
+    """Return the name of the sensor that a name, or a topic, means; the same name if there is none."""
+    topic = name.strip("/")
+    return (
+        name
+        if name in streams
+        else next((n for n, s in streams.items() if s.source.strip("/") == topic), name)
+    )
 
 
 def stream_statistics(t_ns: IntArray) -> tuple[int, int, int, float, float]:

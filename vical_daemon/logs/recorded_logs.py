@@ -26,7 +26,7 @@ from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
 from vical_daemon.logs.channel import Channel, UsedMessages, frame_of, stamp_of, with_force, with_stamp
 from vical_daemon.logs.even_images import CameraStamps, PointReader
 from vical_daemon.logs.even_stamps import even_stamps
-from vical_daemon.logs.mcap import LogError, LogReader, segments_in, size_now
+from vical_daemon.logs.mcap import LogError, LogMessage, LogReader, segments_in, size_now
 from vical_daemon.logs.model import (
     ImuArrays,
     Kind,
@@ -40,6 +40,7 @@ from vical_daemon.logs.model import (
     preferred,
     stream_statistics,
 )
+from vical_daemon.logs.ros1_bag import ros2_type, to_cdr
 from vical_daemon.logs.stamp_column import coarseness
 from vical_daemon.logs.stamps import set_back_s
 from vical_daemon.logs.united_imu import forces_at, lacks
@@ -51,6 +52,7 @@ _KIND_OF_TYPE: dict[str, Kind] = {
     POINTS_TYPE: "points",
     TRACKS_TYPE: "tracks",
 }
+SENSOR_TYPES = frozenset(_KIND_OF_TYPE)
 _PLAIN_WORDS = {
     "image_raw",
     "image_mono",
@@ -84,6 +86,25 @@ class RawMessage(NamedTuple):
     type_name: str
     log_time_ns: int
     payload: bytes
+
+
+def as_cdr(message: LogMessage, types: Collection[str]) -> RawMessage | None:
+    """Return a message of an MCAP; of ROS 1 (`mcap convert` of a bag) some types, and others empty.
+
+    Args:
+        message: As it is in the log.
+        types: Of which the content is wanted.
+
+    Returns:
+        None if it is in another encoding.
+    """
+    channel, payload, kind = message.channel, message.payload, message.channel.type_name
+    if channel.encoding == "ros1":
+        kind = ros2_type(kind)
+        payload = to_cdr(payload, kind, types)
+    elif channel.encoding != "cdr":
+        return None
+    return RawMessage(channel.topic, kind, message.log_time_ns, payload)
 
 
 class LogRecording(Recording):
@@ -309,7 +330,10 @@ class LogRecording(Recording):
     def _stream(self, topic: str, channel: Channel) -> Stream:
         stamps = np.sort(channel.t_ns())
         statistics = stream_statistics(stamps)
-        return Stream(channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution)
+        of_images = topic.split(" ")[0] if channel.kind in ("image", "compressed") else ""
+        return Stream(
+            channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution, topic=of_images
+        )
 
     def _nothing(self) -> str:
         wanted = "sensor_msgs/Imu with Image, CompressedImage or vical_msgs points"
@@ -367,9 +391,9 @@ def _with_frame(topic: str, frame: bytes) -> str:
 
 
 def _shows_depth(raw: RawMessage) -> bool:
-    """Whether an image holds distances: `compressedDepth`, or 16UC1 or 32FC1 (REP 118) on such a topic.
+    """Whether an image holds distances: `compressedDepth`, or 16 bit or 32FC1 (REP 118) on such a topic.
 
-    Thermal cameras send 16UC1, too.
+    Thermal cameras send 16UC1, too. (mono16: bags of the RealSense viewer.)
     """
     try:
         if raw.type_name == COMPRESSED_IMAGE_TYPE:
@@ -377,7 +401,7 @@ def _shows_depth(raw: RawMessage) -> bool:
         encoding = decode_image(raw.payload).encoding
     except MessageError:
         return False
-    return encoding in ("16UC1", "32FC1") and "depth" in raw.topic.lower()
+    return encoding in ("16UC1", "mono16", "32FC1") and "depth" in raw.topic.lower()
 
 
 class McapRecording(LogRecording):
@@ -388,11 +412,9 @@ class McapRecording(LogRecording):
             try:
                 reader = LogReader(path, size)
                 for message in reader.messages():
-                    channel = message.channel
-                    if channel.encoding == "cdr":
-                        yield RawMessage(
-                            channel.topic, channel.type_name, message.log_time_ns, message.payload
-                        )
+                    channel, raw = message.channel, as_cdr(message, SENSOR_TYPES)
+                    if raw is not None:
+                        yield raw
                     else:
                         self._others[channel.topic] = f"{channel.type_name} in {channel.encoding}, not CDR"
             except LogError as error:

@@ -298,6 +298,8 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
         result["inputs"] = [use.to_json() for use in outcome.inputs]
     for name, camera in result["cameras"].items():
         camera["resolution"] = list(job.priors[name].resolution)
+        if job.cameras[name].topic:
+            camera["topic"] = job.cameras[name].topic
     if result["imu"] is not None:
         result["imu"] |= {"name": job.imu.name, "noise": asdict(noise_of(job))}
     result["warnings"] = [text for part in job.parts for text in part.recording.warnings]

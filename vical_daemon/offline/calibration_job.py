@@ -11,9 +11,10 @@ from vical_daemon.bus import topics
 from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
 from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
-from vical_daemon.logs import Recording, Stream
+from vical_daemon.logs import Recording, Stream, meant
 from vical_daemon.logs.channel import stamp_of
 from vical_daemon.offline.accel_shift import AccelShift
+from vical_daemon.offline.camera_names import priors_meant
 from vical_daemon.offline.errors import InputError, OptionError, size_unknown
 
 _COPIED = 0.05  # share of the readings; where a log was split, a few may be in both files
@@ -115,12 +116,16 @@ def make_job(
     if skip_s >= recording.duration_s:
         raise OptionError(f"--skip {skip_s:g}: {recording.path} is only {recording.duration_s:.1f} s long")
     imu_stream = _choose("imu", recording.imus, imu)
-    chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
+    chosen = dict(recording.cameras)
+    if camera:
+        stream = _choose("camera", recording.cameras, camera)
+        chosen = {stream.name: stream}
     if not chosen:
-        unread = "; ".join(w for w in recording.warnings if "unreadable" in w or "no stamps" in w)
+        reasons = ("unreadable", "no stamps", "no cameras")
+        unread = "; ".join(w for w in recording.warnings if any(reason in w for reason in reasons))
         why = f" ({unread})" if unread else "; `vical info` shows what is in it"
         raise InputError(f"{recording.path} holds no camera, neither images nor points{why}")
-    cameras = _cameras_meant(initial, chosen)
+    cameras = priors_meant(initial, chosen)
     priors = {name: _prior(name, stream, cameras.get(name), fix) for name, stream in chosen.items()}
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
@@ -197,28 +202,14 @@ def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:
     if name is None:
         if len(streams) == 1:
             return next(iter(streams.values()))
-        known = ", ".join(streams) or "none"
+        known = ", ".join(f"{stream.name}: {stream.source}" for stream in streams.values()) or "none"
         raise OptionError(f"the recording has {len(streams)} {what}s ({known}); say which with --{what}")
+    name = meant(streams, name)
     if name not in streams:
         raise InputError(
             f"there is no {what} {name!r} in the recording (known: {', '.join(streams) or 'none'})"
         )
     return streams[name]
-
-
-def _cameras_meant(initial: Initial, chosen: dict[str, Stream]) -> dict[str, CameraPrior]:
-    """Return priors by the recording's names; the only camera of the file may have another name there.
-
-    Raises:
-        OptionError: The file is of other cameras.
-    """
-    given = initial.cameras
-    if not given or any(name in given for name in chosen):
-        return given
-    if len(given) == 1:
-        return dict.fromkeys(chosen, next(iter(given.values())))
-    here, there = ", ".join(chosen), ", ".join(given)
-    raise OptionError(f"--initial has {there}, the recording has {here}: rename the camera in the file")
 
 
 def _prior(name: str, stream: Stream, prior: CameraPrior | None, fix: Sequence[str]) -> CameraPrior:
@@ -302,6 +293,13 @@ def suspects(job: Job) -> str:
     things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
     if job.config.target:
         things.insert(0, f"the sizes in {job.config.target}")
-    waits = "; all wait for a camera that hardly sees the target: --camera NAME takes one of them alone"
-    check = f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
-    return check + (waits if job.config.target and len(job.cameras) > 1 else "")
+    return (
+        f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}{one_alone(job)}"
+    )
+
+
+def one_alone(job: Job) -> str:
+    """What to try where one of several cameras may hold up the others; empty: it cannot be that."""
+    if not job.config.target or len(job.cameras) == 1:
+        return ""
+    return "; all wait for a camera that hardly sees the target: --camera NAME takes one of them alone"

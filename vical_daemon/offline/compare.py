@@ -9,6 +9,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import Status
+from vical_daemon.offline.camera_names import by_recording
 from vical_daemon.offline.errors import InputError
 from vical_daemon.offline.sources import read_known
 from vical_daemon.results.compare import FALSE_ALARM, Verdict, directions, judge
@@ -147,7 +148,9 @@ def compare(
 def _pairs(
     a: dict[str, KnownCamera], b: dict[str, KnownCamera], camera: str | None
 ) -> tuple[list[tuple[KnownCamera, KnownCamera]], list[str]]:
-    """Cameras of the same name; of one camera each, whatever their names."""
+    """Cameras of the same name, or of one topic; of one camera each, whatever their names."""
+    a = by_recording(a, {name: known.topic for name, known in a.items()}, b)
+    b = by_recording(b, {name: known.topic for name, known in b.items()}, a)
     names = [name for name in a if name in b and camera in (None, name)]
     if not names and camera is None and len(a) == len(b) == 1:
         (x,), (y,) = a.values(), b.values()

@@ -16,7 +16,7 @@ from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.tools.observability import Motion, Setup
-from vical_daemon.logs import open_recording
+from vical_daemon.logs import meant, open_recording
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 from vical_daemon.offline.observability_tracks import MAX_FRAMES, MAX_SECONDS, motion_without_board
 from vical_daemon.offline.td_icp.request import choose_gyro, prior_of
@@ -52,8 +52,10 @@ def motion_of(
         InputError: No imu, no motion to work with, or no calibration without a board.
     """
     recording = open_recording(path, cameras=[camera] if camera else (), check=False)
+    for warning in recording.warnings:
+        warn(warning)
     cameras = recording.cameras
-    name = camera or next(iter(cameras), None)
+    name = meant(cameras, camera) if camera else next(iter(cameras), None)
     if name is None or name not in cameras or (camera is None and len(cameras) > 1):
         raise OptionError(
             f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}"

@@ -24,11 +24,11 @@ from vical_daemon.bus.messages import (
     decode_transforms,
     merge_calibrations,
 )
-from vical_daemon.bus.topics import parse_key
-from vical_daemon.logs import RecordingError
-from vical_daemon.logs.bags import bag_messages
-from vical_daemon.logs.mcap import LogError, LogReader, segments_in
-from vical_daemon.logs.recorded_logs import RawMessage, name_of_topic
+from vical_daemon.logs import RecordingError, mcap_files
+from vical_daemon.logs.bags import bag_messages, is_bag
+from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.recorded_logs import RawMessage, as_cdr
+from vical_daemon.offline.camera_names import camera_name
 from vical_daemon.offline.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def read_source(source: str) -> Rig:
         raise InputError(f"{source}: no such file")
     if path.is_dir() and any(path.glob("*.json")) and not any(path.glob("*.mcap")):
         return _from_store(path)
-    if path.is_dir() or path.suffix in (".mcap", ".bag") or path.name.endswith(".mcap.part"):
+    if path.is_dir() or mcap_files(path) or is_bag(path):
         return _from_log(path)
     return read_rig(path)
 
@@ -90,15 +90,15 @@ def _from_log(path: Path) -> Rig:
 
 def _messages(path: Path) -> Iterator[RawMessage]:
     """Yield the messages of a log or bag as CDR; metadata of MCAP files come as messages without a type."""
-    files = segments_in(path) if path.is_dir() else [path]
-    if path.suffix == ".bag" or (not files and (path / "metadata.yaml").is_file()):
+    files = mcap_files(path)
+    if not files and is_bag(path):
         yield from bag_messages(path, _ROS_TYPES)
         return
     for file in files:
         reader = LogReader(file)
         for m in reader.messages():
-            if m.channel.encoding == "cdr":
-                yield RawMessage(m.channel.topic, m.channel.type_name, m.log_time_ns, m.payload)
+            if (raw := as_cdr(m, _ROS_TYPES)) is not None:
+                yield raw
         for name, values in reader.metadata:
             yield RawMessage(name, "", 0, json.dumps(values).encode())
 
@@ -152,17 +152,12 @@ class _Found:
             frame = next(iter(self.parents)) if len(self.parents) == 1 else rig.imu_frame
             return replace(rig, devices=self.devices, imu_frame=frame)
         if self.infos or self.transforms:
-            lenses = {_camera_name(topic): info for topic, info in self.infos.items()}
+            lenses = {camera_name(topic): info for topic, info in self.infos.items()}
             return rig_from_ros(lenses, self.transforms, sorted(self.imu_frames), str(path))
         raise InputError(
             f"{path}: no calibration in this log, and no CameraInfo with static transforms; run "
             f"`vical calibrate {path} --target FILE -o result.json` and give result.json"
         )
-
-
-def _camera_name(topic: str) -> str:
-    parsed = parse_key(topic.strip("/"))
-    return name_of_topic(topic, "cam") if parsed is None else parsed.name
 
 
 def _from_store(folder: Path) -> Rig:

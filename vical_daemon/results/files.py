@@ -79,10 +79,11 @@ def _known_without_lens(path: Path) -> dict[str, KnownCamera] | None:
     if path.suffix not in (".yaml", ".yml"):
         return None
     try:
-        priors = read_initial(path).cameras
+        initial = read_initial(path)
     except ConfigError:
         return None
-    found = {name: known_prior(name, prior, path.name) for name, prior in priors.items()}
+    topics = initial.topics
+    found = {n: known_prior(n, prior, path.name, topics.get(n, "")) for n, prior in initial.cameras.items()}
     known = {name: camera for name, camera in found.items() if camera is not None}
     if not known:
         raise ExportError(f"{path}: no camera with T_cam_imu in it")
@@ -95,7 +96,7 @@ def _read_yaml(path: Path) -> str:
     except OSError as error:
         raise ExportError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise ExportError(f"{path}: not a text file") from None
+        raise ExportError(f"{path}: not a text file in UTF-8") from None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

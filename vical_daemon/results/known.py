@@ -49,6 +49,7 @@ class KnownCamera:
         reading_hashes: See `CalibrationEstimate`; (): not known.
         serials: Serial numbers of imu and camera; "": not known.
         notes: What was assumed, in words.
+        topic: ROS topic of the images; "": not known.
     """
 
     name: str
@@ -68,6 +69,7 @@ class KnownCamera:
     reading_hashes: tuple[int, ...] = ()
     serials: tuple[str, str] = ("", "")
     notes: tuple[str, ...] = ()
+    topic: str = ""
 
     @property
     def sigma(self) -> FloatArray:
@@ -88,7 +90,7 @@ def known_cameras(rig: Rig, source: str) -> dict[str, KnownCamera]:
     return {name: _known(camera, rig, source) for name, camera in rig.cameras.items()}
 
 
-def known_prior(name: str, prior: CameraPrior, source: str) -> KnownCamera | None:
+def known_prior(name: str, prior: CameraPrior, source: str, topic: str = "") -> KnownCamera | None:
     """Return what a Kalibr file claims that may lack its lens; None without a pose."""
     if prior.T_imu_cam is None:
         return None
@@ -104,6 +106,7 @@ def known_prior(name: str, prior: CameraPrior, source: str) -> KnownCamera | Non
         prior.distortion_model,
         prior.resolution if prior.resolution != (0, 0) else None,
         np.zeros((7 + n, 7 + n)),
+        topic=topic,
     )
     return _completed(bare)
 
@@ -161,6 +164,7 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
             rig.reading_hashes,
             (rig.devices.get("imu", ""), rig.devices.get(f"camera/{camera.name}", "")),
             notes,
+            camera.topic,
         )
     )
 

@@ -48,15 +48,15 @@ def write_output(path: Path, data: str | bytes) -> None:
 
     Args:
         path: The file.
-        data: Its content; text becomes UTF-8.
+        data: Its content; text becomes UTF-8, with ? for what that lacks (names of files that are not UTF-8).
 
     Raises:
         OSError: It cannot be written, or its folder is missing; names the file.
     """
-    content = data.encode() if isinstance(data, str) else data
+    content = data.encode(errors="replace") if isinstance(data, str) else data
     place = path.resolve()
     try:
-        before = place.stat()
+        before = path.stat()
     except FileNotFoundError:
         before = None
         place.parent.stat()  # `atomic_write` would make it

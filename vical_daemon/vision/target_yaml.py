@@ -143,7 +143,7 @@ def _read_text(path: Path) -> str:
     except FileNotFoundError:
         raise TargetError(f"{path}: no such file; `vical target` makes a board and its YAML") from None
     except UnicodeDecodeError:
-        raise TargetError(f"{path}: not a text file; give the target YAML") from None
+        raise TargetError(f"{path}: not a text file in UTF-8; give the target YAML") from None
     except OSError as error:
         raise TargetError(f"{path}: {error.strerror or error}; give the target YAML") from None
 

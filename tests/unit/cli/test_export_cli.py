@@ -206,7 +206,11 @@ def test_allan_mistakes(still_csv, capsys, words, code, says):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("a,b\n1,2\n", "cannot be read"), ("", "is empty"), ("1,2,3,4,5,6,7\n", "at least 100")],
+    [
+        ("a,b\n1,2\n", "line 2 is not 7 numbers: '1,2'; expected timestamp [ns], 3 gyro and 3 accelerometer"),
+        ("", "is empty"),
+        ("1,2,3,4,5,6,7\n", "only 1 samples after --skip and --seconds, 100 are needed"),
+    ],
 )
 def test_csv_mistakes(tmp_path, capsys, text, says):
     path = tmp_path / "x.csv"

@@ -279,6 +279,12 @@ class TestInitial:
             ("image_width: 752\ncamera_matrix:\n  rows: 3\n", "a file of ROS; .* Kalibr's form"),
             ("sensor_type: camera\nT_BS: {cols: 4}\n", "EuRoC's sensor.yaml"),
             ("target_type: aprilgrid\ntagCols: 6\n", "a target file; give it with --target"),
+            (
+                '%YAML:1.0\nuse_fej: true\nrelative_config_imucam: "a.yaml"\n',
+                r"OpenVINS's .* give the kalibr_imu",
+            ),
+            ("%YAML:1.0\ncameras:\n     - {T_SC:\n        [1, 0]}\n", "a camera file of OKVIS or maplab"),
+            ("label: rig\ncameras:\n- camera:\n    label: c\n", "a camera file of OKVIS or maplab"),
             ("rig: rover\ncameras: {cam0: {uri: x}}\n", "a config of vical; .*`cam0: {intrinsics"),
         ],
     )
@@ -302,6 +308,11 @@ class TestInitial:
             (
                 "cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}",
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5; the model with these is plumb_bob",
+            ),
+            ("cam0: {T_cam_imu: [1, 0, 0, 0]}", r"T_cam_imu.0: expected a list like"),
+            (
+                f"cam0: {{T_cam_imu: {[0] * 16}}}",
+                r"T_cam_imu: expected 4 values, found 16: each must be a list like",
             ),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
             ("cam0: {camera_model: fisheye}", "is not pinhole"),

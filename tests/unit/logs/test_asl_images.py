@@ -93,3 +93,11 @@ def test_a_table_does_not_lead_out_of_the_folder(write):
     folder, _ = write(lambda i, t: f"{t}", ("mav0/cam0/data.csv", lambda i, t: f"{t},../{t}.png"))
     with pytest.raises(RecordingError, match=r"line 1: expected 'timestamp \[ns\],filename'"):
         open_recording(folder)
+
+
+@pytest.mark.parametrize("size", ["[752, 480]", "[6, 8]"])
+def test_images_have_the_size_that_they_have(write, size):
+    """They were made smaller, or the file is of another camera: all of them were refused, silently."""
+    folder, _ = write(lambda i, t: f"{t}")
+    (folder / "mav0/cam0/sensor.yaml").write_text(f"sensor_type: camera\nresolution: {size}\n")
+    assert open_recording(folder).cameras["cam0"].resolution == (8, 6)

@@ -483,7 +483,9 @@ def test_images_of_depth_are_no_camera(tmp_path, a_motion):
             writer.write("vical/rig0/camera/thermal/image", encode_image(t, "thermal", depth, "16UC1"), t)
             writer.write("vical/rig0/camera/depth/image", encode_image(t, "depth", depth, "16UC1"), t)
             writer.write("vical/rig0/camera/zed_depth/image", with_stamp(flat, t), t)
+            viewer = encode_image(t, "depth", depth, "mono16")
+            writer.write("vical/rig0/camera/rs_Depth_0/image", viewer, t)
             writer.write("vical/rig0/camera/packed/image/compressed", with_stamp(packed, t), t)
     recording = open_recording(tmp_path / "a.mcap")
     assert sorted(recording.cameras) == ["color", "thermal"]
-    assert sum("images of depth, left out" in w for w in recording.warnings) == 3
+    assert sum("images of depth, left out" in w for w in recording.warnings) == 4

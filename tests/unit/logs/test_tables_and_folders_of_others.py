@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.offline.calibration_job import make_job
+from vical_daemon.offline.errors import InputError
 
 
 @pytest.fixture
@@ -76,3 +79,32 @@ def test_a_copy_in_the_folder_is_named(asl_folder, tmp_path):
                 writer.write(key, payload, stamp_of(payload))
     with pytest.raises(RecordingError, match="is one of the files a copy of another"):
         open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        (["run1/mav0/x", "run2/a.bag"], "found recordings in it: give one of run1, run2"),
+        (["img/0.png", "imu.txt"], r"found images in img/, tables imu\.txt$"),
+        (["movie.MP4", "gyro.csv"], r"tables gyro\.csv, movie\.MP4 \(a video is not read: extract its"),
+        (["left/data/0.jpg", "imu0.csv"], r"cam0, cam1 \.\.\.; found images in left/data/"),
+        (["cam0/1600000000000000000.png", "imu0.txt"], r"no IMU data: .* images in cam0/, tables imu0\.txt"),
+    ],
+)
+def test_what_may_have_been_meant_is_named(tmp_path, asl_folder, files, says):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    if "imu0.csv" in files:
+        shutil.copyfile(asl_folder / "mav0/imu0/data.csv", tmp_path / "imu0.csv")
+    with pytest.raises((RecordingError, InputError), match=says) as refused:
+        make_job(open_recording(tmp_path), Initial(), target=None)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_video_is_no_recording(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"x")
+    with pytest.raises(
+        RecordingError, match=r"a\.mp4 is no recording: a video is not read: extract its images"
+    ):
+        open_recording(tmp_path / "a.mp4")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 from vical_daemon.bus.messages import COMPRESSED_IMAGE_TYPE, encode_compressed_image
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.cli import calibration_text
+from vical_daemon.cli.calibrate import conclude
+from vical_daemon.cli.errors import CliError
 from vical_daemon.config.priors import Initial, read_initial
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.logs import Stream, open_recording
@@ -124,6 +127,12 @@ def test_a_second_camera_that_hardly_sees_the_target_is_suspected(shortest: Path
     assert "--camera" not in suspects(job)
     job.cameras["cam1"] = job.cameras["cam0"]
     assert suspects(job).endswith("hardly sees the target: --camera NAME takes one of them alone")
+    outcome, nothing = SimpleNamespace(wrong_target="cam1: 7 orientations"), {"reason": "", "guidance": ""}
+    args, result = SimpleNamespace(report=None, output=None), {"cameras": {}, "status": "waiting", **nothing}
+    with pytest.raises(
+        CliError, match=r"cam1: 7 orientations; all wait for a camera .*: --camera NAME takes"
+    ):
+        conclude(args, job, outcome, result, ())
     job.config = replace(job.config, target=None)  # without a target each camera is on its own
     assert "--camera" not in suspects(job)
 

@@ -1,6 +1,7 @@
 """Files that a person asked for: the earlier one is kept where the new one cannot be written."""
 
 import errno
+import os
 import resource
 import stat
 from pathlib import Path
@@ -50,6 +51,16 @@ def test_links_are_followed_modes_kept_and_devices_written_to(tmp_path: Path) ->
     assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
     with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
         write_output(Path("/dev/full"), "x")
+    reading, writing = os.pipe()
+    write_output(Path(f"/dev/fd/{writing}"), "to a pipe, as -o /dev/stdout in a pipeline")
+    assert os.read(reading, 100).startswith(b"to a pipe")
+    os.close(reading)
+    os.close(writing)
     with pytest.raises(FileNotFoundError):
         write_output(tmp_path / "missing" / "x", "x")
     assert not (tmp_path / "missing").exists()
+
+
+def test_names_of_files_that_are_no_text_do_not_stop_a_report(tmp_path: Path) -> None:
+    write_output(tmp_path / "r.html", "made from " + os.fsdecode(b"\xff.mcap"))
+    assert (tmp_path / "r.html").read_text() == "made from ?.mcap"

@@ -95,33 +95,21 @@ def _variance(covariance: Any) -> float:
 def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
     """Yield (topic, type, function that decodes) of all messages of any log of ROS messages."""
     from vical_daemon.bus.messages.schemas import typestore
-    from vical_daemon.logs.mcap import LogError, LogReader, segments_in
+    from vical_daemon.logs import mcap_files
+    from vical_daemon.logs.bags import bag_messages, is_bag
+    from vical_daemon.logs.mcap import LogError, LogReader
+    from vical_daemon.logs.recorded_logs import as_cdr
 
-    store = typestore()
-    folder = path.is_dir() and not (path / "metadata.yaml").is_file()
-    if folder or (path.suffix != ".bag" and path.is_file() and path.suffix != ".db3"):
-        files = segments_in(path) if folder else [path]
-        if not files:
-            raise InputError(f"{path} is no log of messages: topics need an MCAP or a bag")
-        try:
-            for file in files:
-                for m in LogReader(file).messages():
-                    channel = m.channel
-                    if channel.encoding == "cdr":
-                        data, kind = m.payload, channel.type_name
-                        yield channel.topic, kind, lambda d=data, k=kind: store.deserialize_cdr(d, k)
-        except LogError as error:
-            raise InputError(str(error)) from None
-        return
-    yield from _bag_messages(path.parent if path.suffix == ".db3" else path)
-
-
-def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
-    from vical_daemon.logs.bags import open_bag
-
-    with open_bag(path) as reader:
-        for c, _, data in reader.messages():
-            yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
+    store, files = typestore(), mcap_files(path)
+    if not files and not is_bag(path):
+        raise InputError(f"{path} is no log of messages: topics need an MCAP or a bag")
+    logged = (as_cdr(m, _POSE_TYPES) for file in files for m in LogReader(file).messages())
+    try:
+        for raw in logged if files else bag_messages(path, _POSE_TYPES):
+            if raw is not None:
+                yield raw.topic, raw.type_name, lambda r=raw: store.deserialize_cdr(r.payload, r.type_name)
+    except LogError as error:
+        raise InputError(str(error)) from None
 
 
 def trajectory_file(path: Path, base_ns: int | None, warn: Warn = ignore) -> tuple[OrientationStream, int]:

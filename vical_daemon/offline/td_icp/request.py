@@ -11,7 +11,8 @@ import numpy.typing as npt
 from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
-from vical_daemon.logs import Recording, open_recording
+from vical_daemon.logs import Recording, meant, open_recording
+from vical_daemon.offline.camera_names import priors_meant
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 
 
@@ -77,7 +78,7 @@ def choose_gyro(
         raise InputError(f"{recording.path} holds no IMU data")
     if name is None and len(imus) > 1:
         raise OptionError(f"{recording.path} holds the imus {', '.join(imus)}; choose one with --imu")
-    chosen = name or next(iter(imus))
+    chosen = meant(imus, name) if name else next(iter(imus))
     if chosen not in imus:
         raise OptionError(f"{recording.path} holds no imu {chosen!r}, only {', '.join(imus)}")
     arrays = recording.imu_arrays(chosen)
@@ -85,8 +86,9 @@ def choose_gyro(
 
 
 def prior_of(initial: Initial, camera: str) -> CameraPrior | None:
-    """Return what a file says about a camera; a single camera of another name is meant for it."""
-    prior = initial.cameras.get(camera)
-    if prior is None and len(initial.cameras) == 1:
-        prior = next(iter(initial.cameras.values()))
-    return prior
+    """Return what a file says about a camera; a single camera of another name is meant for it.
+
+    Raises:
+        OptionError: The file is of other cameras.
+    """
+    return priors_meant(initial, [camera]).get(camera)

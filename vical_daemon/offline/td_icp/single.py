@@ -11,7 +11,7 @@ from vical_daemon.estimation.temporal.delay_windows import DelayReport, delay_wi
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.temporal.track_registration import track_registration
-from vical_daemon.logs import Recording
+from vical_daemon.logs import Recording, meant
 from vical_daemon.offline.errors import InputError, OptionError
 from vical_daemon.offline.td_icp.request import TdIcpRequest, choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import LensUsed, camera_stream, seconds, track_frames
@@ -78,7 +78,7 @@ def _choose_camera(recording: Recording, name: str | None) -> str:
             f"{recording.path} holds the cameras {', '.join(cameras)}; choose one with --camera, "
             "or several with --sensors"
         )
-    camera = name or next(iter(cameras))
+    camera = meant(cameras, name) if name else next(iter(cameras))
     if camera not in cameras:
         raise OptionError(f"{recording.path} holds no camera {camera!r}, only {', '.join(cameras)}")
     return camera

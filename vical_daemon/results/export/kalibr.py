@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vical_daemon.config.priors import Initial, priors_in
+from vical_daemon.config.priors import Initial, is_camera, priors_in
 from vical_daemon.config.strict_yaml import ConfigError, Document, Value, read
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.results.export.rig import ExportError, Rig, RigCamera
@@ -70,7 +70,7 @@ def read_camchain(path: Path) -> Rig:
             imu = _document(_named_by(path, of_imu))
         path = _named_by(path, named)
         document = _document(path)
-    names = [name for name in document.root if name.startswith("cam")]
+    names = [name for name, section in document.root.items() if is_camera(name, section)]
     if not names:
         raise ExportError(f"{path}: no camera (cam0: …) in it; is it a Kalibr camchain?")
     priors = _priors(document)
@@ -88,7 +88,8 @@ def _document(path: Path) -> Document:
     document.root = {
         key: value
         for key, value in document.root.items()
-        if (key.startswith(("cam", "imu")) and isinstance(value, dict)) or key.startswith("relative_config")
+        if (isinstance(value, dict) and (key.startswith("imu") or is_camera(key, value)))
+        or key.startswith("relative_config")
     }
     return document
 

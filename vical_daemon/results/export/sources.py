@@ -104,6 +104,7 @@ def _camera(name: str, entry: Any) -> RigCamera:
             timeshift_sigma_s=None if sigma is None else float(sigma),
             readout_s=float(entry.get("readout_s") or 0.0),
             readout_axis=str(entry.get("readout_axis") or ""),
+            topic=str(entry.get("topic") or ""),
             unobservable=tuple(entry.get("unobservable") or ()),
             lens_sigma=tuple(float(v) for v in lens_sigma) if len(lens_sigma) == n - 7 else (),
             calibration_covariance=None if not joint else np.array(joint, dtype=np.float64).reshape(n, n),

@@ -1,0 +1,61 @@
+"""Says what a folder holds that is no recording as it is: others name their files in other ways."""
+
+from __future__ import annotations
+
+import os
+from itertools import islice
+from pathlib import Path
+
+from vical_daemon.logs.asl_images import IMAGE_SUFFIXES
+
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".h264", ".h265", ".svo", ".svo2"})
+FROM_VIDEO = "a video is not read: extract its images into cam0/, named by their stamps in ns"
+_TABLES = frozenset({".csv", ".txt", ".tsv", ".json"})
+_LOGS = frozenset({".mcap", ".bag", ".db3"})
+_LOOKED_AT = 200  # entries of a folder; what is in it shows in the first ones
+_NAMED = 4  # in a message of one line
+
+
+def what_is_there(folder: Path) -> str:
+    """Return what a user may have meant, beginning with a semicolon; empty: nothing is known.
+
+    Args:
+        folder: That was given.
+    """
+    entries = _entries(folder)
+    recordings = [e.name for e in entries if any(x.name == "mav0" or x.suffix in _LOGS for x in _entries(e))]
+    if recordings:
+        return f"; found recordings in it: give one of {_listed(recordings)}"
+    tables = [e.name for e in entries if e.suffix.lower() in _TABLES]
+    videos = [e.name for e in entries if e.suffix.lower() in VIDEOS]
+    found = [
+        images_in(folder),
+        f"tables {_listed(tables)}" if tables else "",
+        f"{_listed(videos)} ({FROM_VIDEO})" if videos else "",
+    ]
+    return f"; found {', '.join(filter(None, found))}" if any(found) else ""
+
+
+def images_in(folder: Path) -> str:
+    """Return which folders inside of a folder, or of one in it, hold images; empty: none."""
+    folders = [place for entry in _entries(folder) for place in (entry, *_entries(entry))]
+    names = [
+        f"{place.relative_to(folder)}/"
+        for place in folders
+        if any(file.suffix.lower() in IMAGE_SUFFIXES for file in _entries(place))
+    ]
+    return f"images in {_listed(names)}" if names else ""
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Return the first entries of a folder by name; none where it is none, or may not be read."""
+    try:
+        with os.scandir(folder) as scan:
+            return sorted(Path(entry.path) for entry in islice(scan, _LOOKED_AT))
+    except OSError:
+        return []
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
