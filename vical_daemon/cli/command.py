@@ -199,11 +199,11 @@ def _rig(bus: Bus, wanted: str) -> str:
     parsed = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
     rigs = sorted({entry.rig for entry in parsed if entry is not None})
     if not rigs:
-        raise CliError("nothing on the bus yet; is `vical run` (vical.target) up?")
+        raise CliError("nothing on the bus yet; is `vical run` (vical.target) running?")
     if wanted and wanted not in rigs:
-        raise CliError(f"the rig {wanted} is not on this bus, only {', '.join(rigs)}")
+        raise CliError(f"rig {wanted} is not on this bus, only {', '.join(rigs)}")
     if wanted:
         return wanted
     if len(rigs) > 1:
-        raise CliError(f"there are the rigs {', '.join(rigs)}: say which with --rig", EXIT_USAGE)
+        raise CliError(f"several rigs are on this bus ({', '.join(rigs)}): choose one with --rig", EXIT_USAGE)
     return rigs[0]

@@ -73,7 +73,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"vical: warning: not converged: {rig.status}: {rig.reason}", file=sys.stderr)
     for camera in rig.cameras.values():
         for direction in camera.unobservable:
-            print(f"vical: warning: {camera.name}: not revealed by the motion: {direction}", file=sys.stderr)
+            print(
+                f"vical: warning: {camera.name}: not determined by the motion: {direction}", file=sys.stderr
+            )
     if args.output:
         written = write_files(files, Path(args.output))
         if args.json:

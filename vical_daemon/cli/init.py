@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if not folder.is_dir():
         raise CliError(f"-o {args.output}: its folder does not exist", EXIT_USAGE)
     if args.emulated and (args.port or args.target):
-        raise CliError("--emulated brings its own IMU and board: leave --port and --target out", EXIT_USAGE)
+        raise CliError("--emulated brings its own IMU and board: omit --port and --target", EXIT_USAGE)
     makes_target = args.target is not None or args.emulated
     _refuse_to_overwrite(args, [args.output, *([folder / _TARGET_FILE] if makes_target else [])])
     from vical_daemon.cli import init_config
@@ -120,8 +120,8 @@ def _look(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[FoundCam
     if not imus and not cameras:
         why = f" ({problem})" if problem else ""
         raise CliError(
-            f"neither IMU nor camera is plugged in{why}; `vical devices` says what answered, `vical doctor` "
-            "what stands in the way. Without hardware: vical init --emulated"
+            f"no IMU and no camera found{why}; `vical devices` shows what answered, `vical doctor` "
+            "what may be wrong. Without hardware: vical init --emulated"
         )
     return imus, cameras
 

@@ -57,7 +57,7 @@ def check_port(flag: str, port: int | None) -> None:
         CliError: It lies outside 0 (any free one) to 65535.
     """
     if port is not None and not 0 <= port <= 65535:
-        raise CliError(f"{flag} {port}: a port lies between 0 and 65535", EXIT_USAGE)
+        raise CliError(f"{flag} {port}: a port must be 0 to 65535", EXIT_USAGE)
 
 
 def is_leaf(parser: argparse.ArgumentParser) -> bool:

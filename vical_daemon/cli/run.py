@@ -169,8 +169,8 @@ def _run_children(args: argparse.Namespace, config: Config, names: list[str]) ->
     # Asked before anything starts: record and calibrate would join the bus of the other one.
     if "acquire" in names and reach(socket_path(config.bus)) is Reach.OPEN:
         raise CliError(
-            f"vical runs already: another process hosts the bus at {socket_path(config.bus)}; stop it first "
-            "(systemctl status vical-acquire), or set bus.socket"
+            f"vical is already running: another process hosts the bus at {socket_path(config.bus)}; "
+            "stop it first (systemctl status vical-acquire), or set bus.socket"
         )
     more = [flag for flag in ("--verbose", "--quiet") if getattr(args, flag[2:])]
     file, me = Path(args.config).absolute(), str(os.getpid())

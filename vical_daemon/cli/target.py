@@ -156,7 +156,7 @@ def _must_write(args: argparse.Namespace, yaml_path: Path, target: Target) -> bo
             return False
     if not args.force:
         raise CliError(
-            f"{yaml_path} exists and says something else (sizes that were measured?); choose another name "
+            f"{yaml_path} exists with other contents (measured sizes?); choose another name "
             "with -o or --yaml, print it with --from, or overwrite it with --force"
         )
     return True

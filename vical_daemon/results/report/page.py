@@ -137,9 +137,9 @@ def scene(document: dict[str, Any]) -> str:
     return (
         f'<div class="scene"><script type="application/json">{data}</script>'
         '<canvas role="img" tabindex="0" aria-label="3-D view of IMU, camera and board; '
-        'arrow keys turn it, plus and minus bring it nearer"></canvas>'
+        'arrow keys rotate it, plus and minus zoom"></canvas>'
         f"<p>{rooms}{gains}</p>"
-        '<p class="note">Drag to turn, wheel or two fingers to come nearer. Red: where the camera may be; '
+        '<p class="note">Drag to rotate, scroll or pinch to zoom. Red: where the camera may be; '
         "at its axes: where their tips may be.</p></div>"
     )
 
