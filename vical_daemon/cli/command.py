@@ -33,12 +33,13 @@ _ANSWER_S = 5.0  # estimates come five times a second
 _STATUS_S = 2.0  # within this time a role has said how it is
 _BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.worker`
 _EPILOG = """\
+examples:
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began
   vical command reset             forget it and start over; the store stays as it is
   vical command check             with `mode: verify`: check the stored calibration now, without a pause
   vical command calibrate         with `mode: verify`: calibrate, store the result, and verify it from then on
-  vical command verify            ends such a calibration
+  vical command verify            with `mode: verify`: end such a calibration
   vical command record-start      begin a recording (record-stop ends it)
 
 exit code: 0 done; 1 no answer, the result was refused, or the command has no effect in this mode; 2 bad usage

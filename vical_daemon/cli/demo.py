@@ -56,9 +56,18 @@ store: {{directory: {store}}}
 """
 
 
+_EPILOG = """\
+afterwards:
+  vical info DIR/*.mcap
+  vical calibrate DIR/*.mcap --target DIR/target.yaml
+
+exit code: 0 converged, and the truth is within 4 sigma; 1 otherwise
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "afterwards: vical info DIR/*.mcap; vical calibrate DIR/*.mcap --target DIR/target.yaml"
+    parser.epilog = _EPILOG
     parser.add_argument(
         "--seconds",
         type=float,

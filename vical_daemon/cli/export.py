@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
 _EPILOG = """\
+examples:
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
   vical export log.mcap --format openvins -o openvins/         write every file of the format to a folder

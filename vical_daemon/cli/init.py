@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  vical init                        what is plugged in; uses a target file that lies next to the config
+  vical init                        what is plugged in; uses a target file next to the config
   vical init --target aprilgrid     also makes board.pdf to print, and target.yaml
   vical init --emulated             no hardware: an emulated IMU and a rendered camera
 
-It asks no questions. Each line of the config says what it is for; correct what you know better.
+It asks no questions. Comments in the config explain each key; correct what vical could not determine.
 """
 _BOARD_FILE, _TARGET_FILE = "board.pdf", "target.yaml"
 

@@ -20,8 +20,15 @@ if TYPE_CHECKING:
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
 
+_EPILOG = """\
+example:
+  vical observability log.mcap --target target.yaml
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
     parser.add_argument("--target", metavar="FILE", help="target file of the board, Kalibr's format")
     parser.add_argument("--initial", metavar="FILE", help="Kalibr's files with prior values")

@@ -31,11 +31,18 @@ _POLL_S = 0.2
 _CLAIM_S = 12.0  # a process that was told to stop is usually gone; a child that fails later is tried again
 
 
+_EPILOG = """\
+examples:
+  vical run -c vical.yaml                 everything; then, in another terminal: vical watch
+  vical run imu record -c vical.yaml      record the IMU only
+
+As a service: vical install-service
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = (
-        "as a service: vical install-service; on a laptop: vical run -c vical.yaml, then vical watch"
-    )
+    parser.epilog = _EPILOG
     parser.add_argument(
         "roles",
         metavar="ROLE",

@@ -38,13 +38,13 @@ EPILOG = """examples:
   vical target --type aprilgrid --paper a0 --tag-size 88mm -o board.pdf
   vical target --type checkerboard --cols 8 --rows 7 --square 30mm -o board.svg
   vical target --from board.yaml -o board.pdf                     print an existing target file
+
 Print at 100 %, measure the printed ruler, and correct the target file if it is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.epilog = EPILOG
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--type", choices=("aprilgrid", "checkerboard"), help="kind of board")
     what.add_argument(

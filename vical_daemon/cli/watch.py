@@ -23,9 +23,16 @@ if TYPE_CHECKING:
 _REFRESH_S = 0.25
 
 
+_EPILOG = """\
+examples:
+  vical watch -c vical.yaml
+  vical watch --until-converged --timeout 120 && echo done        in a script
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "in a script: vical watch --until-converged --timeout 120 && echo done"
+    parser.epilog = _EPILOG
     add_config(parser, required=False)
     parser.add_argument(
         "--connect",
