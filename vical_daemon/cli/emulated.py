@@ -33,7 +33,7 @@ def make_rig(
 
     Args:
         board: What the camera sees.
-        camera_rate_hz: Frames a second.
+        camera_rate_hz: Frames per second.
         seed: Chooses motion, noise and biases.
         devices: Of imu and camera, those that are to run.
     """

@@ -96,7 +96,7 @@ class FoundCamera:
         model: Of the camera.
         serial_number: Or what stands for it.
         size: width, height, px.
-        rate_hz: Frames a second.
+        rate_hz: Frames per second.
         exposure: As the camera reports it, s; "unknown": it does not; "": it could not be asked.
         offers: Formats and sizes it has.
         problem: Why it could not be asked; empty: it could.
