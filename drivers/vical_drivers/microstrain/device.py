@@ -59,7 +59,7 @@ def open_imu(
         port: Path of the serial port; ``/dev/serial/by-id/...`` survives a replug.
         protocol: "single-byte", "mip", or "auto": whichever is answered.
         rate_hz: Samples per second; the nearest rate the device can divide to is taken.
-        filter_width: M of the GX3's moving average, 1 .. 32 ms; its delay is subtracted from the stamps. None:
+        filter_width: M of the GX3's moving average: 1 .. 32 ms; its delay is subtracted from stamps. None:
             one sample interval, so that averages neither overlap nor leave gaps.
         baud: Bits per second for streaming; None: as found, or more where the rate needs it. Temporary.
         link: Kind of link: "auto", "usb", "ftdi" or "uart"; decides whether bytes take wire time.
