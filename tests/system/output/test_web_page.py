@@ -225,7 +225,7 @@ def test_in_a_browser(fed, browser, tmp_path):
     marks, misfit, status, lever, drawn, devices, outside, errors = browser.drive(script)
     assert errors == []
     assert marks  # detected and predicted
-    assert misfit.startswith("48 corners, half of them within 0.")
+    assert misfit.startswith("48 corners, median error 0.")
     assert status
     assert lever.startswith("x")
     assert "±" in lever

@@ -41,8 +41,8 @@ def camera_rows(camera: dict[str, Any]) -> list[Row]:
     for i, axis in enumerate("xyz"):
         rows.append((f"lever arm {axis}", *value(1e3 * pose["p_m"][i], 1e3 * sigma[i]), "mm"))
     angles = zip(euler_deg(q), euler_sigma_deg(q, pose["covariance"]), strict=True)
-    for name, (angle, spread) in zip(("roll (X)", "pitch (Y)", "yaw (Z)"), angles, strict=True):
-        rows.append((f"rotation {name}", *value(angle, spread), "deg"))
+    for name, (angle, spread) in zip(("roll (x)", "pitch (y)", "yaw (z)"), angles, strict=True):
+        rows.append((name, *value(angle, spread), "deg"))
     rows.append(("quaternion w x y z", " ".join(f"{v:+.6f}" for v in q), "", ""))
     about = " ".join(f"{s:.4f}" for s in np.degrees(sigma[3:]))
     rows.append(("sigma about cam x y z", about, "", "deg"))

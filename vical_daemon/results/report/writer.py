@@ -111,7 +111,7 @@ def _head(result: Mapping[str, Any]) -> str:
     return page.head(_TITLE, str(result.get("status", "unknown")), verdict(result), facts)
 
 
-_COUNTS = (("frames", "frames"), ("imu_samples", "inertial samples"))
+_COUNTS = (("frames", "frames"), ("imu_samples", "IMU samples"))
 
 
 def _imu_section(result: Mapping[str, Any], gallery: Gallery) -> list[str]:
