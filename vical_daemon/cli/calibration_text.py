@@ -48,8 +48,8 @@ def _consistency(result: dict[str, Any]) -> str:
     nis, refused = result["nis_per_dof"], f"{100 * result['rejected_fraction']:.2f} % of the points rejected"
     if _target_free(result):
         return (
-            f"stretches of the data differ by {nis:.2f} times the variance expected (1 when consistent; "
-            f"more widens the sigmas), {refused}"
+            f"stretches of the data differ by {nis:.2f} times the expected variance (1: consistent; "
+            f"above 1: the sigmas are inflated), {refused}"
         )
     return f"NIS per degree of freedom {nis:.2f} (1: consistent; below 1: cautious), {refused}"
 

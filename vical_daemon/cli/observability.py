@@ -166,8 +166,8 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
     from vical_daemon.estimation.wording import direction_line
 
     print(
-        f"{document['rank']} of {document['unknowns']} unknowns determined by {document['seconds']:.0f} s, "
-        f"{document['frames']} frames (the model allows {document['model']['rank']} "
+        f"{document['rank']} of {document['unknowns']} unknowns are observable in {document['seconds']:.0f} s, "
+        f"{document['frames']} frames (best motion: {document['model']['rank']} "
         f"of {document['model']['unknowns']})"
     )
     units = {
@@ -180,7 +180,7 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
         "intrinsics": (1.0, "px"),
         "readout": (1e3, "ms"),
     }
-    print("bound on sigma for a perfect IMU:")
+    print("lower bound on sigmas, for a perfect IMU:")
     for name, values in document["sigma"].items():
         factor, unit = units.get(name, (1.0, ""))
         words = "  ".join("lost" if v is None else f"{factor * v:.2g}" for v in values)

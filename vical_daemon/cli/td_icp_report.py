@@ -87,4 +87,4 @@ def print_joint(result: JointResult, lenses: dict[str, LensUsed]) -> None:
 
 
 def _because(widened: float) -> str:
-    return f"{widened:.1f} times, because stretches of the recording disagree (does the delay wander?)"
+    return f"{widened:.1f} times, because stretches of the recording disagree (is the delay constant?)"

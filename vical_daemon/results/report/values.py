@@ -110,7 +110,7 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
     nis = float(result.get("nis_per_dof") or 0.0)
     if nis > 1.5 and free:
         lines.append(
-            f"Stretches of the data differ by {nis:.2f} times the variance expected. The sigmas "
+            f"Stretches of the data differ by {nis:.2f} times the expected variance. The sigmas "
             "include that. Check the lens model, the shutter and the stamps."
         )
     elif nis > 1.5:
