@@ -166,7 +166,7 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
     from vical_daemon.estimation.wording import direction_line
 
     print(
-        f"{document['rank']} of {document['unknowns']} unknowns are observable in {document['seconds']:.0f} s, "
+        f"{document['rank']} of {document['unknowns']} unknowns observable in {document['seconds']:.0f} s, "
         f"{document['frames']} frames (best motion: {document['model']['rank']} "
         f"of {document['model']['unknowns']})"
     )
