@@ -20,6 +20,8 @@ Picture = Callable[[int, str, int, int], Bytes]
 CID_EXPOSURE_AUTO = 0x009A0901
 CID_EXPOSURE_ABSOLUTE = 0x009A0902
 CID_EXPOSURE_AUTO_PRIORITY = 0x009A0903
+CID_FOCUS_ABSOLUTE = 0x009A090A
+CID_FOCUS_AUTO = 0x009A090C
 CID_GAIN = 0x00980913
 CID_AUTOGAIN = 0x00980912
 INACTIVE = 0x0010
@@ -60,6 +62,11 @@ def webcam_controls() -> list[FakeControl]:
             off_unless=(CID_EXPOSURE_AUTO, 1),
         ),
         FakeControl(CID_EXPOSURE_AUTO_PRIORITY, "Exposure, Dynamic Framerate", BOOLEAN, 0, 1, 1),
+        FakeControl(
+            CID_FOCUS_ABSOLUTE, "Focus, Absolute", INTEGER, 0, 250, 20,
+            off_unless=(CID_FOCUS_AUTO, 0),
+        ),
+        FakeControl(CID_FOCUS_AUTO, "Focus, Automatic Continuous", BOOLEAN, 0, 1, 1),
     ]  # fmt: skip
 
 

@@ -51,6 +51,9 @@ _EXPOSURE = """\
 _NO_EXPOSURE = """\
     assume_exposure_s: {guess}      # a guess: not reported; half its error is in the time shift
 """
+_AUTOMATIC_EXPOSURE = """\
+    exposure_s: {guess}             # it was automatic; fixed, stamps are exact. Raise it if images are dark
+"""
 _NO_CAMERA = """\
   # cam0:                        # none was found: plug it in, then vical init --force
   #   uri: v4l2:/dev/video0
@@ -97,7 +100,8 @@ class FoundCamera:
         serial_number: Or what stands for it.
         size: width, height, px.
         rate_hz: Frames per second.
-        exposure: As the camera reports it, s; "unknown": it does not; "": it could not be asked.
+        exposure: As the camera reports it, s; "automatic": the camera sets it; "unknown": it does not
+            report it; "": it could not be asked.
         offers: Formats and sizes it has.
         problem: Why it could not be asked; empty: it could.
     """
@@ -216,7 +220,9 @@ def _imu(name: str, imu: dict[str, Any]) -> str:
 def _camera(name: str, camera: FoundCamera) -> str:
     width, height = camera.size
     exposure = _NO_EXPOSURE.format(guess=_GUESSED_EXPOSURE_S)
-    if camera.exposure != "unknown":
+    if camera.exposure == "automatic":
+        exposure = _AUTOMATIC_EXPOSURE.format(guess=_GUESSED_EXPOSURE_S)
+    elif camera.exposure != "unknown":
         exposure = _EXPOSURE.format(exposure=f"{camera.exposure} s" if camera.exposure else "as it is")
     text = _CAMERA.format(
         name=name,

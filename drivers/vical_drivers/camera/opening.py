@@ -169,7 +169,8 @@ def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str
 def check_open_camera(source: FrameSource, uri: str, timeout_s: float = 3.0, **wanted: Any) -> list[str]:
     """Do what `check_camera` does with a camera that is open already; closes it."""
     with source:
-        problems = _compare(source.info, wanted)
+        info = source.info
+        problems = _compare(info, wanted)
         try:
             frame = source.read(timeout_s)
         except DriverError as error:
@@ -184,10 +185,14 @@ def check_open_camera(source: FrameSource, uri: str, timeout_s: float = 3.0, **w
         )
     if frame.stamp_rule.startswith("raw-") and wanted.get("stamp") != "raw":
         problems.append(
-            f"{uri}: the exposure is not known, so stamps are not mid-exposure ({frame.stamp_rule}); "
-            "set exposure_s, or state assume_exposure_s"
+            f"{uri}: the exposure is {_how_unknown(info)}, "
+            f"so stamps are not mid-exposure ({frame.stamp_rule}); set exposure_s, or state assume_exposure_s"
         )
     return problems
+
+
+def _how_unknown(info: DeviceInfo) -> str:
+    return "automatic" if info.details.get("exposure_s") == "automatic" else "not known"
 
 
 def _compare(info: DeviceInfo, wanted: Mapping[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ from vical_drivers.camera import opening
 from vical_drivers.camera.v4l2.discovery import list_v4l2_cameras
 from vical_drivers.samples import DeviceInfo
 from vical_mocks.gx3_emulator import Gx3Emulator
-from vical_mocks.v4l2_camera import FakeCamera
+from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 from vical_mocks.v4l2_kernel import FakeKernel
 
 from vical_daemon.cli import devices, init_config, main
@@ -90,6 +90,15 @@ def test_json_stands_alone_on_stdout(computer, capsys) -> None:
     answer = json.loads(capsys.readouterr().out)
     assert answer["config"] == "vical.yaml" and answer["imus"] == [] and len(answer["cameras"]) == 1
     assert answer["target"] is None and answer["check"] is None
+
+
+def test_an_automatic_exposure_is_fixed_because_stamps_depend_on_it(computer) -> None:
+    camera = FakeCamera()
+    computer.plug(camera)
+    assert camera.control(CID_EXPOSURE_AUTO).value == 3
+    assert main(["init", "--no-check"]) == 0
+    config = load("vical.yaml").cameras["cam0"]
+    assert (config.exposure_s, config.assume_exposure_s) == (0.01, None)
 
 
 @pytest.mark.system

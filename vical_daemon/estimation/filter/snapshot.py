@@ -65,6 +65,8 @@ def _calibration_covariance(
     if f.unobservable is not None:
         out[:6, :6] += f.unobservable.covariance()
         out[6, 6] += f.unobservable.timeshift_sigma_s**2
+    if name in f.shared:  # the time shift of one instant, not only its mean
+        out[6, 6] += f.shared[name].wander_s ** 2
     return out
 
 

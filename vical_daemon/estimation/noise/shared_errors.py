@@ -22,7 +22,7 @@ from vical_daemon.estimation.noise.variance_components import SIZE, Observed, gr
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 MEMORY = 400  # images by which a noise is known
-TELLING = 100  # images; the correlation of neighbours is then known to 0.1
+_TELLING = 50  # images; the correlation of neighbours is then known to 0.14
 _EVERY = 20  # images that are added together; nothing is said before, unless a start said it
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
@@ -43,7 +43,9 @@ class SharedErrors:
         jitter_found_s: The jitter where there surely is one, s; else 0.
         wander_px: The shift where it is large and that of neighbours alike (image stabilisation, a loose
             lens, a board that moves); else 0.
-        wander_s: Likewise of the delays of the images (an exposure that adapts to the light).
+        wander_s: Likewise of the delays of the images (an exposure that adapts to the light), also while it
+            is not told yet whether they are alike.
+        told: Images are enough to tell whether those of neighbours are alike.
         images: Images taken in.
         until_s: Stamp (s) up to which images are known from the start, and are not to count again; -inf once
             they have passed.
@@ -54,6 +56,7 @@ class SharedErrors:
     jitter_found_s: float = 0.0
     wander_px: float = 0.0
     wander_s: float = 0.0
+    told: bool = False
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
@@ -116,7 +119,8 @@ class SharedErrors:
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
         surely, alike = 1.0 - known.absent[0] > SURE, self._alike(0, self.jitter_s)
         self.jitter_found_s = self.jitter_s if surely and alike < PERSISTENT else 0.0
-        varies = surely and self.jitter_s > _WANDERS_S and PERSISTENT < alike < _MOST_ALIKE
+        self.told = math.isfinite(alike)
+        varies = surely and self.jitter_s > _WANDERS_S and (not self.told or PERSISTENT < alike < _MOST_ALIKE)
         self.wander_s = self.jitter_s if varies else 0.0
         wanders = self.shift_px > _WANDERS_PX and PERSISTENT < self._alike(1, self.shift_px) < math.inf
         self.wander_px = self.shift_px if wanders else 0.0
@@ -129,7 +133,7 @@ class SharedErrors:
         """
         n = min(self.images, MEMORY)
         size = self._A[:n, way, way]
-        if n < TELLING or not (size > 0.0).all() or sigma == 0.0:
+        if n < _TELLING or not (size > 0.0).all() or sigma == 0.0:
             return math.inf
         late, usual = self._b[:n, way] / size, self._C[:n, way, way] / size**2
         weight = 1.0 / (usual + sigma**2)

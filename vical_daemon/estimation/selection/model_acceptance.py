@@ -14,7 +14,7 @@ from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIG
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.noise.shared_errors import MEMORY, TELLING
+from vical_daemon.estimation.noise.shared_errors import MEMORY
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens_block, not_zero, term_block
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
@@ -118,7 +118,7 @@ def _needed(f: CalibrationFilter, name: str, shares: Weights) -> int:
         return 0
     if name == LAG or any(not_zero(shares, other) > OFF for other in held):
         return MEMORY
-    return TELLING if held else 0
+    return MEMORY // 4 if held else 0
 
 
 def _off(f: CalibrationFilter, name: str) -> Event:

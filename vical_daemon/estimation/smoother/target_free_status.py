@@ -68,7 +68,6 @@ class TargetFreeStatus(Evaluator):
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling)
         self._mounting = MountingWatch()
-        self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -144,21 +143,12 @@ class TargetFreeStatus(Evaluator):
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; the rest is kept."""
         self.announce(Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s))
-        self._clock_changed_s.append(self.elapsed_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
     def biases_stepped(self, gyro_rps: float) -> None:
         """The biases of the imu stepped, the gyro's by so much, rad/s; the rest is kept."""
         self.announce(Event(EventKind.BIASES_STEPPED, value=gyro_rps))
         self._quiet, self._against_since_s = (Cause.NONE, None), None
-
-    @property
-    def _clock_wanders(self) -> bool:
-        """Whether the clocks changed twice, and may well change again: no time as long has passed since."""
-        if len(self._clock_changed_s) < 2:
-            return False
-        before_s, last_s = self._clock_changed_s
-        return self.elapsed_s - last_s < last_s - before_s
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:
@@ -186,8 +176,6 @@ class TargetFreeStatus(Evaluator):
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
         carry, events = self.models.window_done(carry, self.factor())
-        if any(event.kind in (EventKind.TIMESHIFT_STEPPED, EventKind.CLOCK_WANDER) for event in events):
-            self._clock_changed_s.append(self.elapsed_s)
         self.announce_all(events)
         return carry
 

@@ -130,6 +130,7 @@ class Evaluator:
         self._size: deque[float] = deque(maxlen=400)
         self._squares: deque[tuple[float, int]] = deque(maxlen=squares)
         self._ever_converged = self.believed = False
+        self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
 
     def saw_reading(self, t_ns: int, gyro: Sequence[float], accel: Sequence[float]) -> None:
         """Count one inertial reading, and keep the size of some."""
@@ -167,11 +168,21 @@ class Evaluator:
     def announce(self, event: Event, once: str = "") -> None:
         """Put an event into the next estimate; of those with the same `once` only the first."""
         self._events.add(event, once)
+        if event.kind in (EventKind.TIMESHIFT_STEPPED, EventKind.CLOCK_WANDER):
+            self._clock_changed_s.append(self.elapsed_s)
 
     def announce_all(self, events: Iterable[Event]) -> None:
         """Put events into the next estimate."""
         for event in events:
-            self._events.add(event)
+            self.announce(event)
+
+    @property
+    def _clock_wanders(self) -> bool:
+        """Whether the clocks changed twice, and may well change again: no time as long has passed since."""
+        if len(self._clock_changed_s) < 2:
+            return False
+        before_s, last_s = self._clock_changed_s
+        return self.elapsed_s - last_s < last_s - before_s
 
     def nis_per_dof(self) -> float:
         """Consistency: mean of normalised squares per degree of freedom; 1 when consistent."""

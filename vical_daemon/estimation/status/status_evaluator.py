@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, 
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.status.evaluator import (
+    CONFIRMING,
     Evaluator,
     Verdict,
     lacking_verdict,
@@ -151,7 +153,7 @@ class StatusEvaluator(Evaluator):
         if shared.wander_px:
             event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
             self.announce(event, once=f"wander {report.camera}")
-        if shared.wander_s:
+        if shared.wander_s and shared.told:
             event = Event(EventKind.TIMESHIFT_VARIES, report.camera, shared.wander_s)
             self.announce(event, once=f"varies {report.camera}")
 
@@ -231,12 +233,13 @@ class StatusEvaluator(Evaluator):
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
         drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in _seen(f))
-        if self.clocks_doubtful or any(drifts):
+        if self.clocks_doubtful or self._clock_wanders or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
         if any(x.wander_px for x in f.shared.values()):
             return IMAGES_WANDER
-        if any(x.wander_s for x in f.shared.values()):
-            return SHIFT_VARIES
+        varying = [x for x in f.shared.values() if x.wander_s]
+        if varying:
+            return SHIFT_VARIES if any(x.told for x in varying) else CONFIRMING
         return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=self.believed), "")
 
     def weighed(self, f: CalibrationFilter, shares: model_mixture.Weights | None = None) -> CalibrationFilter:
@@ -261,6 +264,9 @@ class StatusEvaluator(Evaluator):
         where = f.layout.cameras[name]
         if where.position is None and where.timeshift is None:
             return []
+        if name in f.shared:  # no motion would show better what varies
+            square = e.timeshift_sigma_s**2 - f.shared[name].wander_s ** 2
+            e = replace(e, timeshift_sigma_s=math.sqrt(max(square, 0.0)))
         weak = self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
         return weak if len(f.layout.cameras) == 1 else [of_camera(direction, name) for direction in weak]
 

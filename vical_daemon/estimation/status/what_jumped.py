@@ -186,28 +186,26 @@ def what_jumped(
         return None
     images = [x.image for x in taken]
     odds = _ODDS * before.consistency[camera].strictness
-    none = sum(x.log_likelihood for x in taken)
+    none = np.cumsum([x.log_likelihood for x in taken])
     refused = [k for k, x in enumerate(taken) if not x.used]
-    instants = _suspects(before, taken, camera, refused, odds)
+    suspects = _suspects(before, taken, camera, refused, odds)
     if after_gap:
-        instants.pop(Part.BIASES, None)
+        suspects = [x for x in suspects if x[0] is not Part.BIASES]
+    filters = _filters_at({k for _, k in suspects}, before, images, step)
     found: dict[Part, _Jump] = {}
-    filters: dict[int, CalibrationFilter] = {}
-    f, likelihood = deepcopy(before), 0.0
-    last = max((k for at in instants.values() for k in at), default=-1)
-    for k, image in enumerate(images[: last + 1]):
-        parts = [part for part, at in instants.items() if k in at]
-        if parts:
-            filters[k] = deepcopy(f)
-        for part in parts:
-            after = _follow_after(filters[k], {part: 1.0}, images[k:], camera, step)
-            total = likelihood + after.likelihood + after.jumped.any_size
-            jump = _Jump(total, k, after.jumped.sizes)
-            if jump.likelihood > found.get(part, _Jump(none)).likelihood:
-                found[part] = jump
-        likelihood += _follow(f, image, step)[0]
-    total = max((jump.likelihood for jump in found.values()), default=none)
-    if not total > none + odds:
+    highest, margin = none, 2.0 * odds  # twice what rules a jump out: later images may make up for the rest
+    for part, k in suspects:
+        f, likelihood = filters[k]
+        after = _follow_after(f, {part: 1.0}, images[k:], camera, step, highest[k:] - likelihood - margin)
+        if after is None:
+            continue
+        totals = likelihood + np.asarray(after.likelihoods)
+        if totals[-1] > highest[-1]:
+            highest = np.concatenate([np.full(k, -math.inf), totals])
+        if totals[-1] > found.get(part, _Jump(none[-1])).likelihood:
+            found[part] = _Jump(totals[-1], k, after.jumped.sizes)
+    total = max((jump.likelihood for jump in found.values()), default=-math.inf)
+    if not total > none[-1] + odds:
         return None
     possible = {part for part, jump in found.items() if jump.likelihood > total - odds}
     for part, others in _NOT_BESIDE:
@@ -215,14 +213,29 @@ def what_jumped(
             possible.discard(part)
     best = max(possible, key=lambda part: found[part].likelihood)
     k = found[best].at
+    known, _ = filters[k]
     if possible == {Part.TARGET}:
-        return Found(best, frozenset(possible), deepcopy(filters[k]), filters[k])
+        return Found(best, frozenset(possible), deepcopy(known), known)
     unknown = {part: found[part].sizes for part in possible}
-    after = _follow_after(filters[k], unknown, images[k:], camera, step)
+    after = _follow_after(known, unknown, images[k:], camera, step)
+    assert after is not None  # nothing to fall short of
     for consistency in after.filter.consistency.values():
         consistency.settle()
     fits = _most(after.used) and _most([after.used[at - k] for at in refused if at >= k])
-    return Found(best, frozenset(possible), after.filter, filters[k]) if fits else None
+    return Found(best, frozenset(possible), after.filter, known) if fits else None
+
+
+def _filters_at(
+    instants: set[int], before: CalibrationFilter, images: Frames, step: Step
+) -> dict[int, tuple[CalibrationFilter, float]]:
+    """Filters just before some of the images, and the log-likelihood of the images before those."""
+    f, likelihood = deepcopy(before), 0.0
+    out: dict[int, tuple[CalibrationFilter, float]] = {}
+    for k in range(max(instants, default=-1) + 1):
+        if k in instants:
+            out[k] = (deepcopy(f), likelihood)
+        likelihood += _follow(f, images[k], step)[0]
+    return out
 
 
 def _most(used: Sequence[bool]) -> bool:
@@ -243,13 +256,13 @@ class _After(NamedTuple):
 
     Attributes:
         filter: It.
-        likelihood: Logarithm of the likelihood of the images.
+        likelihoods: Logarithm of the likelihood of the images up to each, if the jump may be of any size.
         used: Which of them it used.
         jumped: By how much these parts jumped.
     """
 
     filter: CalibrationFilter
-    likelihood: float
+    likelihoods: Sequence[float]
     used: Sequence[bool]
     jumped: JumpSizes
 
@@ -260,7 +273,8 @@ def _follow_after(
     images: Frames,
     camera: str,
     step: Step,
-) -> _After:
+    least: FloatArray | None = None,
+) -> _After | None:
     """Take images with a copy of a filter to which some parts are unknown.
 
     Args:
@@ -269,6 +283,10 @@ def _follow_after(
         images: From the jump on.
         camera: The one whose images do not fit.
         step: Takes an image with a filter.
+        least: What the log-likelihood of the images up to each must be.
+
+    Returns:
+        None where it is less.
     """
     f, jumps = deepcopy(before), _jumps(before.layout, before.state, camera)
     if Part.KNOCK in parts:
@@ -283,14 +301,23 @@ def _follow_after(
             rows = f.S[f.layout.lens(camera)]
             held[camera] = held[camera].may_have_jumped(rows @ rows.T)
             f.layout = replace(f.layout, held=held)
-    likelihoods, used = zip(*(_follow(f, x, step) for x in images), strict=True)
+    likelihoods: list[float] = []
+    used: list[bool] = []
+    total = 0.0
+    for k, image in enumerate(images):
+        likelihood, taken = _follow(f, image, step)
+        total += likelihood
+        likelihoods.append(total + jumped.any_size)
+        used.append(taken)
+        if least is not None and likelihoods[-1] < least[k]:
+            return None
     f.jumped = None
-    return _After(f, sum(likelihoods), used, jumped)
+    return _After(f, likelihoods, used, jumped)
 
 
 def _suspects(
     before: CalibrationFilter, taken: Sequence[Taken], camera: str, refused: Sequence[int], odds: float
-) -> dict[Part, set[int]]:
+) -> list[tuple[Part, int]]:
     """Find what may have jumped, and when.
 
     Args:
@@ -301,7 +328,8 @@ def _suspects(
         odds: By how much a jump must be more likely than none, in logarithms.
 
     Returns:
-        By part, the images just before which it may have jumped, nothing where no jump is likely.
+        Each part, and an image just before which it may have jumped, the likeliest first; nothing where no
+        jump is likely.
     """
     states, layout = [before.state, *(x.state for x in taken[:-1])], before.layout
     jumps = [_jumps(layout, state, camera) for state in states]
@@ -318,10 +346,13 @@ def _suspects(
         own[Part.KNOCK] = slice(own[Part.SHIFT].start, own[Part.MOUNTING].stop)
     ratios = {part: scores.log_ratios(of) for part, of in own.items()}
     if taken[-1].used and max(x.max() for x in ratios.values()) < odds:
-        return {}
+        return []
     best = {part: int(x.argmax()) for part, x in ratios.items()}
     # images that are refused tell the scores nothing; a large jump may be just before the first of them
-    return {part: {k - 1, k, k + 1, *refused[:1]} for part, k in best.items()}
+    likely = sorted(best, key=lambda part: -ratios[part].max())
+    first = [(part, best[part]) for part in likely]
+    rest = [(part, near) for part, k in first for near in sorted({k - 1, k + 1, *refused[:1]} - {k})]
+    return [(part, k) for part, k in first + rest if 0 <= k < len(taken)]
 
 
 def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) -> tuple[float, bool]:

@@ -94,6 +94,7 @@ class AravisCamera(Closing):
         device = opened["device"]
         _, _, width, height = opened["region"]
         exposure_s = opened["exposure_s"]
+        not_told = "automatic" if opened["automatic"] else "unknown"
         return DeviceInfo(
             kind="camera",
             model=f"{device['vendor']} {device['model']}",
@@ -107,7 +108,7 @@ class AravisCamera(Closing):
                 "size": f"{width}x{height}",
                 "rate_hz": f"{opened['rate_hz']:g}",
                 "encoding": self._settings.encoding,
-                "exposure_s": "unknown" if exposure_s is None else f"{exposure_s:g}",
+                "exposure_s": not_told if exposure_s is None else f"{exposure_s:g}",
             },
         )
 

@@ -132,11 +132,16 @@ class Grabber:
     def exposure_s(self) -> float | None:
         """Exposure in force; None where the camera chooses it or cannot tell."""
         camera = self.camera
-        if not camera.is_exposure_time_available():
-            return None
-        if camera.is_exposure_auto_available() and camera.get_exposure_time_auto() != self.aravis.Auto.OFF:
+        if not camera.is_exposure_time_available() or self.exposure_is_automatic():
             return None
         return float(camera.get_exposure_time()) * 1e-6
+
+    def exposure_is_automatic(self) -> bool:
+        """Whether the camera chooses its exposure itself."""
+        camera = self.camera
+        if not camera.is_exposure_auto_available():
+            return False
+        return bool(camera.get_exposure_time_auto() != self.aravis.Auto.OFF)
 
     def description(self) -> dict[str, Any]:
         """What was obtained."""
@@ -149,6 +154,7 @@ class Grabber:
             "pixel_format": camera.get_pixel_format_as_string(),
             "rate_hz": camera.get_frame_rate() if camera.is_frame_rate_available() else 0.0,
             "exposure_s": self.exposure_s(),
+            "automatic": self.exposure_is_automatic(),
         }
 
     def run(self) -> None:

@@ -122,6 +122,7 @@ class V4l2Camera(Closing):
     def _describe(self) -> DeviceInfo:
         session = self._need_session()
         fmt, exposure_ns = session.format, self._frames.stamper.exposure_ns
+        not_told = "automatic" if session.automatic else "unknown"
         return DeviceInfo(
             kind="camera",
             model=session.identity.card,
@@ -135,7 +136,7 @@ class V4l2Camera(Closing):
                 "size": f"{fmt.width}x{fmt.height}",
                 "rate_hz": f"{session.rate_hz:g}",
                 "encoding": self._settings.encoding,
-                "exposure_s": "unknown" if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
+                "exposure_s": not_told if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
                 "buffers": str(session.buffers),
                 "uvc_metadata": "yes" if session.metadata is not None else "no",
             },

@@ -47,6 +47,7 @@ _ESSENTIAL = (
     abi.CID_GAIN,
     abi.CID_ANALOGUE_GAIN,
     abi.CID_FOCUS_AUTO,
+    abi.CID_IMAGE_STABILIZATION,
     abi.CID_AUTO_WHITE_BALANCE,
 )
 """Asked for by number where the list breaks off."""

@@ -12,6 +12,8 @@ from vical_drivers.errors import DeviceRefusedError
 
 _log = logging.getLogger(__name__)
 _FIXED_EXPOSURE = (abi.EXPOSURE_MANUAL, abi.EXPOSURE_SHUTTER_PRIORITY)
+_MOVES_IMAGE = (abi.CID_FOCUS_AUTO, abi.CID_IMAGE_STABILIZATION)
+"""Controls that change where a camera sees a point while nothing moves. Most webcams focus by themselves."""
 
 
 def apply_settings(controls: Controls, settings: CameraSettings) -> None:
@@ -24,9 +26,26 @@ def apply_settings(controls: Controls, settings: CameraSettings) -> None:
         set_exposure(controls, settings.exposure_s)
     if settings.gain is not None:
         _set_gain(controls, settings.gain)
+    _hold_lens(controls, settings)
     # a manual value is refused while its automatic control is on, so those go first
     for name, value in sorted(settings.controls.items(), key=lambda item: "auto" not in item[0]):
         controls.set(name, round(value))
+
+
+def _hold_lens(controls: Controls, settings: CameraSettings) -> None:
+    """Switch autofocus and image stabilisation off, unless the settings name them."""
+    named = {control.control_id for control in map(controls.find, settings.controls) if control is not None}
+    for control_id in _MOVES_IMAGE:
+        control = controls.find(control_id)
+        if control is None or control_id in named:
+            continue
+        with contextlib.suppress(DeviceRefusedError):  # announced, and not known: some cameras are like that
+            if controls.get(control_id):
+                controls.set(control_id, 0)
+                _log.warning(
+                    "control=%s was=on now=off reason=it changes the lens; name it in controls to keep it on",
+                    control.name,
+                )
 
 
 def set_exposure(controls: Controls, exposure_s: float) -> int:
@@ -65,6 +84,16 @@ def _set_gain(controls: Controls, gain: float) -> None:
     if controls.find(which) is None:
         raise DeviceRefusedError("camera: it has no gain control; leave gain out")
     controls.set(which, round(gain))
+
+
+def is_automatic(controls: Controls) -> bool:
+    """Return whether the camera chooses its exposure itself, and could be told one."""
+    if controls.find(abi.CID_EXPOSURE_ABSOLUTE) is None or controls.find(abi.CID_EXPOSURE_AUTO) is None:
+        return False
+    try:
+        return controls.get(abi.CID_EXPOSURE_AUTO) not in _FIXED_EXPOSURE
+    except DeviceRefusedError:
+        return False
 
 
 def read_exposure_ns(controls: Controls) -> int | None:

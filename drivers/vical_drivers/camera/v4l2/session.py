@@ -9,7 +9,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2 import abi
 from vical_drivers.camera.v4l2.controls import Controls
 from vical_drivers.camera.v4l2.discovery import NodeEntry
-from vical_drivers.camera.v4l2.exposure import apply_settings, read_exposure_ns
+from vical_drivers.camera.v4l2.exposure import apply_settings, is_automatic, read_exposure_ns
 from vical_drivers.camera.v4l2.kernel import Kernel
 from vical_drivers.camera.v4l2.negotiate import negotiate
 from vical_drivers.camera.v4l2.node import NodeIdentity, ObtainedFormat, VideoNode
@@ -30,6 +30,7 @@ class V4l2Session:
         settings: What is asked of the camera.
 
     Attributes:
+        automatic: The camera chooses its exposure itself.
         stamped_ns: The kernel's last stamp, CLOCK_MONOTONIC; None: there was none.
 
     Raises:
@@ -50,6 +51,7 @@ class V4l2Session:
             self.controls = Controls(kernel, self.node)
             apply_settings(self.controls, settings)
             self.exposure_ns = read_exposure_ns(self.controls)
+            self.automatic = is_automatic(self.controls)
             self._watch_exposure()
             self.uvc_hwtimestamps = False
             if self.identity.driver == _UVC_DRIVER and settings.stamp == "auto":

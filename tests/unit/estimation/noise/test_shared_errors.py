@@ -192,7 +192,7 @@ def test_only_what_is_independent_from_image_to_image_is_a_jitter_of_the_stamps(
 
 def test_nothing_is_blamed_on_the_stamps_before_it_is_known_whether_neighbours_are_late_alike():
     rng, shared = np.random.default_rng(5), SharedErrors()
-    for _ in range(60):
+    for _ in range(40):
         ways = np.zeros((60, 3))
         ways[:, 0] = 1000.0 * rng.standard_normal(60)
         shared.learn(

@@ -223,7 +223,7 @@ def test_check_camera_reports_in_words(kernel) -> None:
     assert "asked for rate_hz 50, got 60" in rate
     camera.control(CID_EXPOSURE_AUTO).value = 3
     (exposure,) = check_camera(path, kernel=kernel, rate_hz=30)
-    assert "the exposure is not known, so stamps are not mid-exposure (raw-eof)" in exposure
+    assert "the exposure is automatic, so stamps are not mid-exposure (raw-eof)" in exposure
     (missing,) = check_camera(str(kernel.dev / "video7"), kernel=kernel)
     assert "no such device" in missing
 

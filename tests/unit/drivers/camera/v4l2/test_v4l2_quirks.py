@@ -7,7 +7,15 @@ import errno
 import numpy as np
 import pytest
 from vical_drivers import errors
-from vical_mocks.v4l2_camera import CID_EXPOSURE_ABSOLUTE, INTEGER, FakeCamera, FakeControl, webcam_controls
+from vical_mocks.v4l2_camera import (
+    CID_EXPOSURE_ABSOLUTE,
+    CID_FOCUS_ABSOLUTE,
+    CID_FOCUS_AUTO,
+    INTEGER,
+    FakeCamera,
+    FakeControl,
+    webcam_controls,
+)
 
 S_PARM = 22
 MS = 1_000_000
@@ -37,6 +45,23 @@ def test_an_exposure_that_cannot_be_read_is_unknown_and_one_that_cannot_be_set_i
     assert source.read(1.0).stamp_rule == "raw-eof"
     with pytest.raises(errors.DeviceRefusedError, match="the camera answers with an error"):
         open_fake(camera("2"), number=2, exposure_s=0.004)
+
+
+def test_autofocus_is_switched_off_unless_it_is_named(open_fake, caplog) -> None:
+    """It is on in most webcams, and changes the lens by some per cent."""
+    camera = FakeCamera()
+    open_fake(camera, controls={"focus_absolute": 40})
+    assert (camera.control(CID_FOCUS_AUTO).value, camera.control(CID_FOCUS_ABSOLUTE).value) == (0, 40)
+    assert "control=focus_automatic_continuous was=on now=off" in caplog.text
+    camera = FakeCamera(serial_number="2", port="1-2")
+    open_fake(camera, number=2, controls={"focus_auto": 1})
+    assert camera.control(CID_FOCUS_AUTO).value == 1
+
+
+def test_an_autofocus_that_cannot_be_switched_off_does_not_keep_the_camera_from_running(open_fake) -> None:
+    controls = webcam_controls()
+    controls[-1].stalled = errno.EPIPE
+    assert open_fake(FakeCamera(controls=controls)).read(1.0) is not None
 
 
 @pytest.mark.parametrize("code", [errno.EINVAL, errno.ENOTTY])
