@@ -44,17 +44,17 @@ run "git clone -q $ORIGIN vical && cd vical && make install" 2
 cd ~/vical && PATH=$PWD/.venv/bin:$PATH
 run 'vical doctor' 20
 mkdir rig && cd rig
-say 'Nothing is plugged in here, so `vical init` alone would say so and name the option that does without.'
+say 'Nothing is plugged in here. `vical init` reports that and names the option for an emulated rig.'
 run 'vical init' 6 1
 run 'vical init --emulated' 12
-say 'The service, in the background; in real life in a terminal of its own, with the page at http://127.0.0.1:8080/.'
+say 'The script runs the service in the background. Use a terminal of its own; the page is at http://127.0.0.1:8080/.'
 vical run -c vical.yaml --quiet 2>run.log &
 service=$!
 run 'vical watch -c vical.yaml --until-converged --timeout 300 >/dev/null && echo converged' 3
 say 'The calibration is stored as soon as it is `converged`. This is what other software gets:'
 run 'vical export store --format kalibr -o camchain.yaml && head -12 camchain.yaml' 16
 kill -INT $service && wait $service || true
-say 'The same offline, from a recording: two demos of the same rig are one calibration.'
+say 'The same offline: two demos of the same rig give one calibration.'
 run 'for k in 1 2; do vical demo --seconds 15 --seed $k --out rec$k --quiet >/dev/null || true; done; ls rec1' 8
 run 'vical calibrate rec1/*.mcap rec2/*.mcap --target rec1/target.yaml -o result.json --report report.html && ls -s report.html' 40
 STEPS

@@ -49,7 +49,7 @@ class DeviceTime(msgspec.Struct, frozen=True, gc=False):
     """When one sample was taken, on the device's clock.
 
     Attributes:
-        ticks: Unwrapped ticks, as the device said.
+        ticks: Unwrapped ticks of the device.
         x_s: Device seconds since the mapping began, with the fraction of a tick that rounding took away.
         lost_before: Samples missing just before.
     """
@@ -60,7 +60,7 @@ class DeviceTime(msgspec.Struct, frozen=True, gc=False):
 
 
 class Stamp(msgspec.Struct, frozen=True, gc=False):
-    """What the clock says of one sample.
+    """Host time of one sample.
 
     Attributes:
         t_device_event_ns: When the device's timer was read, on CLOCK_MONOTONIC, ns.
@@ -80,7 +80,7 @@ class DeviceClock:
 
     Attributes:
         restarts: How often the device's timer began anew.
-        outliers: Samples dropped because their time cannot be true.
+        outliers: Samples dropped because their time is impossible.
         repeats: Samples dropped because their time is that of the one before.
         lost: Samples missing between those that came.
 
@@ -121,7 +121,7 @@ class DeviceClock:
 
     @property
     def age_s(self) -> float:
-        """Device seconds since the mapping began; below about 1 s it is not worth much."""
+        """Device seconds since the mapping began; below about 1 s the mapping is inaccurate."""
         return (self._last_ticks - self._first_ticks) / self.tick_hz
 
     def add(self, ticks: int, t_arrival_ns: int) -> DeviceTime | None:

@@ -3,8 +3,8 @@
 An arrival is late by a delay that is never negative, so the truth lies along the *lower* envelope of
 (device time, arrival - device time): a straight line with the offset and the skew of the two clocks,
 touched from above by the luckiest samples (Zhang, Liu, Xia, INFOCOM 2002). Averages (exponential,
-alpha-beta) carry the mean delay as a bias; the envelope does not. What no one-way method can see is the
-*smallest* delay itself: the caller takes off what it knows of it (wire time, the sensor's filters).
+alpha-beta) carry the mean delay as a bias; the envelope does not. No one-way method can see the
+*smallest* delay itself: the caller subtracts the known part of it (wire time, the sensor's filters).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
 
     Attributes:
         t_host_ns: Instant the sensor *measured* (device clock mapped to CLOCK_MONOTONIC, wire time
-            and the sensor's own filter delay taken off), ns.
+            and the sensor's own filter delay subtracted), ns.
         t_arrival_ns: CLOCK_MONOTONIC when the bytes were read, ns; for diagnosis only.
         device_ticks: Device clock, unwrapped (never decreases within one power-up).
         gyro_rps: Angular rate in the imu frame, rad/s.
@@ -71,7 +71,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who a device is; `serial_number` keys the stored calibration."""
+    """Identity of a device; `serial_number` keys the stored calibration."""
 
     kind: str
     model: str
@@ -107,7 +107,7 @@ class Source(Protocol):
 
     @property
     def info(self) -> DeviceInfo:
-        """Who the device is."""
+        """Identity of the device."""
         ...
 
     def stats(self) -> SourceStats:
@@ -134,7 +134,7 @@ class ImuSource(Source, Protocol):
 
         Raises:
             DeviceLostError: The device went away; `read` may be called again after a pause, and the
-                source tries to come back by itself.
+                source reconnects automatically.
             DeviceReplacedError: Another device came back in its place; this source is closed.
         """
         ...

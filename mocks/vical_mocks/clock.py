@@ -121,7 +121,7 @@ class UartLink(_Queue):
 
     Args:
         rng: Source of the jitter.
-        baud: Bits a second.
+        baud: Bits per second.
         jitter_s: Mean of the exponential delay between last byte and arrival.
         buffer_s: What the device would have to queue longer than this it drops, silently.
     """
@@ -158,7 +158,7 @@ class FtdiLink:
 
     Args:
         rng: Source of the jitter of USB and of the timer's phase.
-        baud: Bits a second on the UART side.
+        baud: Bits per second on the UART side.
         latency_s: Latency timer, 16 ms out of the box, 1 ms in low-latency mode.
         packet: Payload of one full USB packet, bytes.
     """

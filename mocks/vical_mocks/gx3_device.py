@@ -30,7 +30,7 @@ class Gx3Device:
         first_ticks: Its timer at the first power-up.
 
     Attributes:
-        baud: Bits a second of its UART.
+        baud: Bits per second of its UART.
         sent: (timer, true host time) of the cycles that sent something: the truth for time stamps.
     """
 

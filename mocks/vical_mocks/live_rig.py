@@ -43,7 +43,7 @@ class LiveRigSettings:
         seed: Chooses motion, biases and noise.
         timeshift_cam_imu_s: True shift: t_imu = t_cam + shift.
         mean_rate_dps: Of the hand motion, deg/s.
-        camera_rate_hz: Frames a second.
+        camera_rate_hz: Frames per second.
         exposure_s: Exposure time.
         stamp_jitter_s: One sigma of the frame stamps.
         distortion: radtan k1 k2 p1 p2.

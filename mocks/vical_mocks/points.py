@@ -77,7 +77,7 @@ class SimulationOptions:
         imu_average_s: Each sample is the mean over so long, centred at its stamp; 0: the instantaneous value
             (the white noise is the same).
         accel_lag_s: How late the accelerometer's readings are against the gyro's.
-        camera_rate_hz: Frames a second.
+        camera_rate_hz: Frames per second.
         corner_sigma_px: White noise per axis.
         noise_spread: Standard deviation of the logarithm of a frame's white noise, as motion blur varies it;
             frames within a second are alike.

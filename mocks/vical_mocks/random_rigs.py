@@ -1,7 +1,7 @@
 """Random rigs, far from the reference: other lenses, boards, rates, noises, motions and faults.
 
 Each seed draws a rig of its own: 320 to 1920 px and 45 to 120 deg across, boards of 2 to 12 cm squares
-that fill half the image, gravity from any side, 5 to 60 images and 100 to 1000 inertial samples a second,
+that fill half the image, gravity from any side, 5 to 60 images and 100 to 1000 inertial samples per second,
 hand motion of 15 to 100 deg/s, sensors from good to cheap, stamps that jitter, outliers, features that break
 off.
 """

@@ -90,4 +90,4 @@ def test_a_config_without_devices_is_not_well(tmp_path: Path, capsys, text: str)
     assert main(["check", "-c", str(tmp_path / "vical.yaml")]) == 2
     out, err = capsys.readouterr()
     assert "all is well" not in out
-    assert "neither imus nor cameras" in err and err.count("\n") == 1
+    assert "no IMUs and no cameras" in err and err.count("\n") == 1

@@ -11,7 +11,7 @@ STUCK_S = 5.0
 """A device loop that has not turned for this long, s, is stuck: STALE, and systemd restarts the process."""
 _RECENT_S = 10.0
 """Samples dropped so recently, s, are a problem of now: the status comes once a second."""
-_BEGINNING = {"opening": "is being opened", "silent": "open, no data yet"}
+_BEGINNING = {"opening": "opening", "silent": "open, no data yet"}
 """States without a problem so far, in words."""
 
 

@@ -10,6 +10,7 @@ import argparse
 import logging
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -31,9 +32,14 @@ Start here:
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
 Every command takes --json (only machine-readable output on stdout) and --help.
-Exit code: 0 done, 1 a known failure (one line on stderr), 2 wrong usage or config,
-3 done, but the calibration is not `converged` or a recording of `merge` disagrees,
-4 `verify`, `compare`: changed, 5 `verify`: cannot tell, `compare`: not comparable.
+
+Exit codes:
+  0   done
+  1   a known failure, with one line on stderr
+  2   wrong usage or config
+  3   done, but the calibration is not `converged`, or a recording of `merge` disagrees
+  4   `verify`, `compare`: changed
+  5   `verify`: cannot tell; `compare`: not comparable
 """
 
 _SEVERAL = ("inputs", "logs", "sources")
@@ -85,7 +91,7 @@ def build_parser(selected: str | None) -> tuple[argparse.ArgumentParser, dict[st
             name,
             help=command.summary,
             description=command.summary[0].upper() + command.summary[1:] + ".",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=options.HelpFormatter,
         )
         if name == selected:
             import_module(command.module).add_arguments(child)
@@ -97,12 +103,16 @@ def build_parser(selected: str | None) -> tuple[argparse.ArgumentParser, dict[st
 
 def help_text(commands: dict[str, table.Command]) -> str:
     """Return the grouped overview that `vical --help` prints."""
-    lines = ["usage: vical COMMAND [options]", "", _INTRO, ""]
+    width = options.help_width()
+    lines = ["usage: vical COMMAND [options]", "", options.fit(_INTRO, width), ""]
     for group in dict.fromkeys(command.group for command in commands.values()):
         lines.append(f"{group}:")
-        lines += [f"  {c.name:<16} {c.summary}" for c in commands.values() if c.group == group]
+        for c in commands.values():
+            if c.group == group:
+                head = f"  {c.name:<16} "
+                lines += textwrap.wrap(c.summary, width, initial_indent=head, subsequent_indent=" " * 19)
         lines.append("")
-    return "\n".join(lines) + "\n" + _TEACHING
+    return "\n".join(lines) + "\n" + options.fit(_TEACHING, width) + "\n"
 
 
 def _dispatch(words: list[str]) -> int:

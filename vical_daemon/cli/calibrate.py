@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     write(args, result)
     for use in outcome.inputs:
         if use.imu is None:
-            warn(f"{use.path} is not in the result: nothing starts from it")
+            warn(f"{use.path} is not in the result: no initialisation succeeded")
     return conclude(args, job, outcome, result, accepted)
 
 
@@ -123,9 +123,9 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
-            raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
+            raise CliError(f"{path}: its folder does not exist; make it first", EXIT_USAGE)
         if path and Path(path).is_dir():
-            raise CliError(f"{path}: is a folder, the name of a file is needed", EXIT_USAGE)
+            raise CliError(f"{path} is a folder: give the name of a file", EXIT_USAGE)
     files = [Path(path).resolve() for path in args.inputs]
     for i, file in enumerate(files):
         if file in files[:i]:

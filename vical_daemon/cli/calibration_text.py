@@ -45,13 +45,13 @@ def describe(result: dict[str, Any]) -> str:
 
 
 def _consistency(result: dict[str, Any]) -> str:
-    nis, refused = result["nis_per_dof"], f"{100 * result['rejected_fraction']:.2f} % of the points refused"
+    nis, refused = result["nis_per_dof"], f"{100 * result['rejected_fraction']:.2f} % of the points rejected"
     if _target_free(result):
         return (
-            f"stretches of the data differ by {nis:.2f} times the variance expected (1 when consistent; "
-            f"more widens the sigmas), {refused}"
+            f"stretches of the data differ by {nis:.2f} times the expected variance (1: consistent; "
+            f"above 1: the sigmas are inflated), {refused}"
         )
-    return f"NIS per degree of freedom {nis:.2f} (1 when consistent, less when cautious), {refused}"
+    return f"NIS per degree of freedom {nis:.2f} (1: consistent; below 1: cautious), {refused}"
 
 
 def _target_free(result: dict[str, Any]) -> bool:
@@ -63,7 +63,7 @@ def _headline(result: dict[str, Any]) -> str:
     without = "without a target, " if _target_free(result) else ""
     return (
         f"{result['status']}{reason}  ({without}{result['duration_s']:.1f} s, {result['frames']} frames, "
-        f"{result['imu_samples']} imu samples, {result.get('cpu_s', 0.0):.1f} s of CPU)"
+        f"{result['imu_samples']} IMU samples, {result.get('cpu_s', 0.0):.1f} s of CPU)"
     )
 
 

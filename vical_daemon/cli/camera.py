@@ -313,7 +313,7 @@ def _snapshot(args: argparse.Namespace) -> int:
         for frame in _frames(source, args):  # noqa: B007 - the last one is wanted
             pass
     if frame is None:
-        raise CliError(f"{args.device}: no frame")
+        raise CliError(f"{args.device}: no frame; is it triggered from outside?")
     write_output(path, encode_image(frame.image, kinds[path.suffix.lower()]))
     if args.json:
         print(json.dumps({"file": str(path), **_facts(frame)}))

@@ -32,8 +32,15 @@ class Finding:
     problem: str = ""
 
 
+_EPILOG = """\
+exit code: 0 no problem; 1 a problem with a device, the target file, the disk or the store;
+2 a mistake in the config
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     add_config(parser)
     parser.add_argument("--no-devices", action="store_true", help="check the files only, open no device")
     add_json(parser)

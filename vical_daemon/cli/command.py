@@ -33,12 +33,13 @@ _ANSWER_S = 5.0  # estimates come five times a second
 _STATUS_S = 2.0  # within this time a role has said how it is
 _BUSY_S = 60.0  # the longest step of an estimator, see `calibrate.worker`
 _EPILOG = """\
+examples:
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began
   vical command reset             forget it and start over; the store stays as it is
   vical command check             with `mode: verify`: check the stored calibration now, without a pause
   vical command calibrate         with `mode: verify`: calibrate, store the result, and verify it from then on
-  vical command verify            ends such a calibration
+  vical command verify            with `mode: verify`: end such a calibration
   vical command record-start      begin a recording (record-stop ends it)
 
 exit code: 0 done; 1 no answer, the result was refused, or the command has no effect in this mode; 2 bad usage
@@ -199,11 +200,11 @@ def _rig(bus: Bus, wanted: str) -> str:
     parsed = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
     rigs = sorted({entry.rig for entry in parsed if entry is not None})
     if not rigs:
-        raise CliError("nothing on the bus yet; is `vical run` (vical.target) up?")
+        raise CliError("nothing on the bus yet; is `vical run` (vical.target) running?")
     if wanted and wanted not in rigs:
-        raise CliError(f"the rig {wanted} is not on this bus, only {', '.join(rigs)}")
+        raise CliError(f"rig {wanted} is not on this bus, only {', '.join(rigs)}")
     if wanted:
         return wanted
     if len(rigs) > 1:
-        raise CliError(f"there are the rigs {', '.join(rigs)}: say which with --rig", EXIT_USAGE)
+        raise CliError(f"several rigs are on this bus ({', '.join(rigs)}): choose one with --rig", EXIT_USAGE)
     return rigs[0]

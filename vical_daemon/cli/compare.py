@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise CliError("--distance must be above 0 m", EXIT_USAGE)
     if len(args.sources) < 2 or (len(args.sources) > 2 and not args.matrix):
         raise CliError(
-            f"two calibrations are compared, {len(args.sources)} are named (more: --matrix)", EXIT_USAGE
+            f"compare takes two calibrations, not {len(args.sources)}; for more use --matrix", EXIT_USAGE
         )
     if args.report and (args.matrix or not Path(args.report).absolute().parent.is_dir()):
         why = "not with --matrix" if args.matrix else f"the folder of {args.report} does not exist"

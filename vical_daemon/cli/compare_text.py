@@ -30,11 +30,11 @@ def _camera(camera: CameraComparison, *, with_map: bool) -> list[str]:
     apart, verdict = camera.difference, camera.verdict
     if apart is None or verdict is None:
         return [f"{name}: not comparable: {camera.why}"]
-    chance = f"{verdict.probability:.2g}" if verdict.probability > 1e-300 else "less than 1e-300"
+    chance = f"= {verdict.probability:.2g}" if verdict.probability > 1e-300 else "< 1e-300"
     what = f"changed: {', '.join(verdict.blocks)}" if verdict.changed else "same"
     lines = [
         f"{name}: {what}",
-        f"  chi-square {verdict.chi_square:.1f} over {verdict.dof} degrees of freedom, by chance {chance} "
+        f"  chi-square {verdict.chi_square:.1f} over {verdict.dof} degrees of freedom, p {chance} "
         f"(changed below {FALSE_ALARM:g})",
     ]
     if apart.common_s > 1.0:
@@ -43,14 +43,14 @@ def _camera(camera: CameraComparison, *, with_map: bool) -> list[str]:
     lines += _rows(apart)
     if apart.unlike_px > 0.0:
         lines.append(
-            f"  lenses of two models, compared as {apart.model}: leaves {apart.unlike_px:.2f} px RMS apart"
+            f"  lenses of two models, compared as {apart.model}: the fit leaves {apart.unlike_px:.2f} px RMS"
         )
     lines += _about_the_lens(camera)
     for m in camera.maps:
         lines += ["", *_pixels(m, full=with_map)]
     if abs(apart.d[6]) > 0.0 and apart.a.lens is not None:
         px = abs(apart.d[6]) * float(apart.a.lens[0])
-        lines.append(f"  the time shifts differ by {px:.2g} px for a rig that turns at 1 rad/s")
+        lines.append(f"  the time shifts differ by {px:.2g} px at a rotation rate of 1 rad/s")
     return lines
 
 
@@ -87,13 +87,13 @@ def _about_the_lens(camera: CameraComparison) -> list[str]:
         return []
     px = f"{camera.lens_px[0]:.2f} ± {camera.lens_px[1]:.2f} px RMS over the image"
     if not camera.held:
-        return ["", f"  the lenses alone project {px} apart"]
+        return ["", f"  the lenses alone differ by {px}"]
     held, free = ("A", "B") if camera.held == "a" else ("B", "A")
     off = "" if camera.held_off_px is None else f" (by its images {camera.held_off_px:.2f} px RMS off)"
     return [
         "",
         f"  {held} held its lens at given values{off}, {free} estimated it.",
-        f"  The lenses alone project {px} apart.",
+        f"  The lenses alone differ by {px}.",
         "  Mounting and time shift differ with the lens; compare two of the same lens to see them alone.",
     ]
 

@@ -56,9 +56,18 @@ store: {{directory: {store}}}
 """
 
 
+_EPILOG = """\
+afterwards:
+  vical info DIR/*.mcap
+  vical calibrate DIR/*.mcap --target DIR/target.yaml
+
+exit code: 0 converged, and the truth is within 4 sigma; 1 otherwise
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "afterwards: vical info DIR/*.mcap; vical calibrate DIR/*.mcap --target DIR/target.yaml"
+    parser.epilog = _EPILOG
     parser.add_argument(
         "--seconds",
         type=float,
@@ -84,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate, acquire, detect, estimate, record; 1 if the outcome is not what it should be."""
     if args.seconds is not None and not 5 <= args.seconds <= 3600:
-        raise CliError("--seconds: 5 to 3600 are of use", 2)
+        raise CliError("--seconds: 5 to 3600 s", 2)
     check_port("--web", args.web)
     out = _folder(args.out)
     before = set(out.rglob("*.mcap"))
@@ -235,10 +244,9 @@ def _print_text(result: dict[str, Any], table: str) -> None:
     truth = result["truth"]
     late_ms, wander_ms = 1e3 * truth["imu_stamp_error_s"], 1e3 * truth["imu_stamp_wander_s"]
     print(
-        "\nThe emulated IMU knows that its samples were stamped "
-        f"{late_ms:+.2f} ± {wander_ms:.2f} ms off on this machine.\n"
-        "The time shift between the stamps, which a calibration finds, contains that; its error/sigma below\n"
-        "allows for the ±."
+        "\nOn this machine the stamps of the emulated IMU were off by "
+        f"{late_ms:+.2f} ± {wander_ms:.2f} ms.\n"
+        "The true time shift below contains this offset, and error/sigma allows for the ±."
     )
     print(f"\n{CAMERA} in the imu frame, compared with the truth\n{table}")
 

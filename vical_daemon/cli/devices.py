@@ -20,8 +20,14 @@ LIMIT_S = 12.0
 """For all ports together: 4 s where nothing answers, and a slow device's answers to seven questions."""
 
 
+_EPILOG = """\
+To make a config from them: vical init
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
+    parser.epilog = _EPILOG
     parser.add_argument(
         "--port",
         action="append",

@@ -26,7 +26,7 @@ _DEVICES = ("ttyUSB*", "ttyACM*", "video[0-9]*", "fw[0-9]*")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "to check config and devices: vical check -c FILE"
+    parser.epilog = "To check a config and its devices: vical check -c FILE"
     add_json(parser)
 
 

@@ -33,7 +33,7 @@ def make_rig(
 
     Args:
         board: What the camera sees.
-        camera_rate_hz: Frames a second.
+        camera_rate_hz: Frames per second.
         seed: Chooses motion, noise and biases.
         devices: Of imu and camera, those that are to run.
     """
@@ -61,7 +61,7 @@ def emulated_devices(config: Config, roles: Collection[str]) -> Iterator[RoleOpt
         yield {}
         return
     if len(imus) > 1 or len(cameras) > 1:
-        raise CliError(f"there is one emulated imu and one emulated camera, not {imus + cameras}", EXIT_USAGE)
+        raise CliError(f"there is one emulated IMU and one emulated camera, not {imus + cameras}", EXIT_USAGE)
     if imus and cameras and len(running) == 1:
         raise CliError(
             "the emulated IMU and camera are moved together: run both in one process (`vical run acquire`)",

@@ -20,7 +20,7 @@ EXIT_CHANGED = 4  # `verify`, `compare`: no longer the same
 EXIT_CANNOT_TELL = 5  # `verify`: this recording cannot tell; `compare`: not comparable
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE, what a shell reports for `cat big | head -1`
 EXIT_INTERRUPTED = 130  # 128 + SIGINT
-NOTHING_TO_RUN = "neither imus nor cameras: there is nothing to run (`vical devices` prints what to write)"
+NOTHING_TO_RUN = "no IMUs and no cameras: there is nothing to run (`vical devices` prints what to write)"
 
 _OURS = ("vical_daemon", "vical_drivers", "vical_mocks")
 _REFUSALS = {

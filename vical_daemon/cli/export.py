@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
 _EPILOG = """\
+examples:
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
   vical export log.mcap --format openvins -o openvins/         write every file of the format to a folder
@@ -73,7 +74,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"vical: warning: not converged: {rig.status}: {rig.reason}", file=sys.stderr)
     for camera in rig.cameras.values():
         for direction in camera.unobservable:
-            print(f"vical: warning: {camera.name}: not revealed by the motion: {direction}", file=sys.stderr)
+            print(
+                f"vical: warning: {camera.name}: not determined by the motion: {direction}", file=sys.stderr
+            )
     if args.output:
         written = write_files(files, Path(args.output))
         if args.json:

@@ -223,7 +223,7 @@ def _poll(args: argparse.Namespace) -> int:
     try:
         kind = int(args.kind, 16)
     except ValueError:
-        raise CliError(f"{args.kind!r} is no hexadecimal number such as 0xCC", 2) from None
+        raise CliError(f"{args.kind!r} is not a hexadecimal number such as 0xCC", 2) from None
 
     def work(session: Session, _baud: int) -> int:
         session.identify()

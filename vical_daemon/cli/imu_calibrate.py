@@ -68,9 +68,7 @@ def run(args: argparse.Namespace) -> int:
         _print_sensor("Accelerometer", found.accel, "mm/s^2")
         _print_sensor("Gyroscope", found.gyro, "mrad/s")
         if not found.gyro_matrix_found:
-            print(
-                "  scale and misalignment not found: make more turns, by 60 degrees and more, about all axes"
-            )
+            print("  scale and misalignment not found: turn it more often, by 60 deg or more, about all axes")
     return 0
 
 

@@ -81,7 +81,7 @@ def at_rest(samples: EvenSamples) -> tuple[EvenSamples, str]:
     limits, a touch does not. A second next to one that moved does not count as rest.
 
     Raises:
-        CliError: It never rests for long enough.
+        CliError: It is never at rest for long enough.
     """
     n = max(round(samples.rate_hz), 1)
     count = len(samples.gyro_rps) // n
@@ -105,8 +105,8 @@ def at_rest(samples: EvenSamples) -> tuple[EvenSamples, str]:
     longest = int(np.argmax(ends - begins)) if len(begins) else 0
     if not len(begins) or ends[longest] - begins[longest] < LEAST_REST_S:
         raise CliError(
-            f"{samples.name}: the IMU never rests for {LEAST_REST_S:g} s: its figures would be those of "
-            "a motion; record it at rest"
+            f"{samples.name}: the IMU is never at rest for {LEAST_REST_S:g} s, which noise densities need; "
+            "record it at rest"
         )
     part = slice(int(begins[longest]) * n, int(ends[longest]) * n)
     rest = replace(samples, gyro_rps=samples.gyro_rps[part], accel_mps2=samples.accel_mps2[part])
@@ -157,9 +157,9 @@ def _read(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray
     if not names:
         raise CliError(f"{path} holds no IMU data")
     if imu is None and len(names) > 1:
-        raise CliError(f"{path} holds the imus {', '.join(names)}; choose one with --imu", EXIT_USAGE)
+        raise CliError(f"{path} has several IMUs: {', '.join(names)}; choose one with --imu", EXIT_USAGE)
     chosen = meant(recording.imus, imu) if imu else names[0]
     if chosen not in names:
-        raise CliError(f"{path} holds no imu {chosen!r}, only {', '.join(names)}", EXIT_USAGE)
+        raise CliError(f"{path} has no IMU {chosen!r}, only {', '.join(names)}", EXIT_USAGE)
     arrays = recording.imu_arrays(chosen)
     return arrays.t_ns, arrays.gyro_rps, arrays.specific_force_mps2, f"{path}: {chosen}"

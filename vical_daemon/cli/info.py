@@ -17,8 +17,18 @@ if TYPE_CHECKING:
     from vical_daemon.logs.summary import Summary, TopicSummary
 
 
+_EPILOG = """\
+examples:
+  vical info log.mcap
+  vical info bag_folder/ mav0/            several recordings, of any kind
+
+exit code: 0 done; 1 a file cannot be read
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument(
         "logs", metavar="LOG", nargs="+", help="an MCAP or bag file, a bag folder or an ASL folder"
     )

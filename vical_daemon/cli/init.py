@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  vical init                        what is plugged in; uses a target file that lies next to the config
+  vical init                        what is plugged in; uses a target file next to the config
   vical init --target aprilgrid     also makes board.pdf to print, and target.yaml
   vical init --emulated             no hardware: an emulated IMU and a rendered camera
 
-It asks no questions. Each line of the config says what it is for; correct what you know better.
+It asks no questions. Comments in the config explain each key; correct what vical could not determine.
 """
 _BOARD_FILE, _TARGET_FILE = "board.pdf", "target.yaml"
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if not folder.is_dir():
         raise CliError(f"-o {args.output}: its folder does not exist", EXIT_USAGE)
     if args.emulated and (args.port or args.target):
-        raise CliError("--emulated brings its own IMU and board: leave --port and --target out", EXIT_USAGE)
+        raise CliError("--emulated brings its own IMU and board: omit --port and --target", EXIT_USAGE)
     makes_target = args.target is not None or args.emulated
     _refuse_to_overwrite(args, [args.output, *([folder / _TARGET_FILE] if makes_target else [])])
     from vical_daemon.cli import init_config
@@ -120,8 +120,8 @@ def _look(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[FoundCam
     if not imus and not cameras:
         why = f" ({problem})" if problem else ""
         raise CliError(
-            f"neither IMU nor camera is plugged in{why}; `vical devices` says what answered, `vical doctor` "
-            "what stands in the way. Without hardware: vical init --emulated"
+            f"no IMU and no camera found{why}; `vical devices` shows what answered, `vical doctor` "
+            "what may be wrong. Without hardware: vical init --emulated"
         )
     return imus, cameras
 

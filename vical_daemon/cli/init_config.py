@@ -99,8 +99,8 @@ class FoundCamera:
         model: Of the camera.
         serial_number: Or what stands for it.
         size: width, height, px.
-        rate_hz: Frames a second.
-        exposure: As the camera reports it, s; "automatic": it chooses it itself; "unknown": it does not
+        rate_hz: Frames per second.
+        exposure: As the camera reports it, s; "automatic": the camera sets it; "unknown": it does not
             report it; "": it could not be asked.
         offers: Formats and sizes it has.
         problem: Why it could not be asked; empty: it could.

@@ -86,7 +86,7 @@ def picture(
     stale = "" if silent_s is None else f"stale, {silent_s:.0f} s old, was "
     head = Text.assemble(
         (f"{stale}{estimate.status}", f"bold {'red' if stale else colour}"),
-        f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} imu samples, "
+        f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} IMU samples, "
         f"NIS/dof {estimate.nis_per_dof:.2f}",
     )
     # padded, it ends its line: what follows would stand on the same line, cut off
@@ -115,7 +115,7 @@ def screen(
         table_of_camera = picture(camera, estimate, [], (silent or {}).get((rig, camera)))
         parts += [Text(f"rig {rig}", style="bold"), Padding(table_of_camera, (0, 0, 1, 0))]
     if not parts:
-        parts.append(Text("waiting for a calibration; is `vical run` (vical.target) up?"))
+        parts.append(Text("waiting for a calibration; is `vical run` (vical.target) running?"))
     table = Table(box=None, pad_edge=False, show_header=False)
     for (rig, name), (level, message) in sorted(health.items()):
         table.add_row(Text(rig, style="dim"), name, Text(level, style=_LEVELS.get(level, "")), message)

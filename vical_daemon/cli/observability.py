@@ -20,8 +20,15 @@ if TYPE_CHECKING:
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
 
+_EPILOG = """\
+example:
+  vical observability log.mcap --target target.yaml
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
     parser.add_argument("--target", metavar="FILE", help="target file of the board, Kalibr's format")
     parser.add_argument("--initial", metavar="FILE", help="Kalibr's files with prior values")
@@ -159,8 +166,8 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
     from vical_daemon.estimation.wording import direction_line
 
     print(
-        f"{document['rank']} of {document['unknowns']} unknowns determined by {document['seconds']:.0f} s, "
-        f"{document['frames']} frames (the model allows {document['model']['rank']} "
+        f"{document['rank']} of {document['unknowns']} unknowns observable in {document['seconds']:.0f} s, "
+        f"{document['frames']} frames (best motion: {document['model']['rank']} "
         f"of {document['model']['unknowns']})"
     )
     units = {
@@ -173,7 +180,7 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
         "intrinsics": (1.0, "px"),
         "readout": (1e3, "ms"),
     }
-    print("bound on sigma for a perfect IMU:")
+    print("lower bound on sigmas, for a perfect IMU:")
     for name, values in document["sigma"].items():
         factor, unit = units.get(name, (1.0, ""))
         words = "  ".join("lost" if v is None else f"{factor * v:.2g}" for v in values)

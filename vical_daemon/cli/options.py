@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import shutil
 import sys
+import textwrap
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,6 +14,47 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 
 _WRITTEN = ("output", "out", "report", "yaml")
 """Options, of all commands, that name a file to write."""
+_REMARK = "   "  # between an example and what is said about it
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Wraps descriptions and epilogs at the terminal's width; examples stay as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return textwrap.indent(fit(text, width - len(indent)), indent)
+
+
+def help_width() -> int:
+    """Return the width of help texts, columns, as argparse chooses it."""
+    return shutil.get_terminal_size().columns - 2
+
+
+def fit(text: str, width: int) -> str:
+    r"""Wrap text at a width, columns.
+
+    Lines without indent are joined to paragraphs. An indented line is an example: its remark, behind three
+    spaces, moves below it where both do not fit.
+
+    >>> print(fit("Two lines\nof text.\n  vical demo   without hardware", 24))
+    Two lines of text.
+      vical demo
+          without hardware
+    """
+    lines: list[str] = []
+    paragraph: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        if line and not line.startswith(" "):
+            paragraph.append(line)
+            continue
+        lines += textwrap.wrap(" ".join(paragraph), width, break_on_hyphens=False)
+        paragraph = []
+        example, _, remark = line.strip().partition(_REMARK)
+        if len(line) <= width or not remark:
+            lines.append(line)
+            continue
+        lines.append(f"  {example}")
+        lines += textwrap.wrap(remark.strip(), width, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join(lines).strip("\n")
 
 
 class VicalParser(argparse.ArgumentParser):
@@ -61,7 +104,7 @@ def check_port(flag: str, port: int | None) -> None:
         CliError: It lies outside 0 (any free one) to 65535.
     """
     if port is not None and not 0 <= port <= 65535:
-        raise CliError(f"{flag} {port}: a port lies between 0 and 65535", EXIT_USAGE)
+        raise CliError(f"{flag} {port}: a port must be 0 to 65535", EXIT_USAGE)
 
 
 def is_leaf(parser: argparse.ArgumentParser) -> bool:
@@ -112,7 +155,7 @@ def add_sensors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--target",
         metavar="FILE",
-        help="target file of the board, Kalibr's format (default: calibrate without a board)",
+        help="target file of the board, Kalibr's format (default: without a board)",
     )
     parser.add_argument(
         "--camera", metavar="NAME", help="use only this camera, by name or topic (default: all)"

@@ -10,9 +10,16 @@ from pathlib import Path
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
 
+_EPILOG = """\
+examples:
+  vical recover log.mcap.part -o log.mcap
+  vical recover /var/lib/vical/log        all unfinished files of a folder
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument("log", metavar="LOG", help="an .mcap or .mcap.part file, or a folder with parts")
     parser.add_argument("-o", "--output", metavar="OUT", help="name of the repaired file (not for a folder)")
     add_json(parser)

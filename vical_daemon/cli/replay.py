@@ -17,8 +17,16 @@ if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus
 
 
+_EPILOG = """\
+examples:
+  vical replay log.mcap                   then, in another terminal: vical watch
+  vical replay log.mcap --speed 0 --streams imu0 cam0
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument("log", metavar="LOG", help="a recording of any kind")
     parser.add_argument(
         "--speed",

@@ -31,11 +31,18 @@ _POLL_S = 0.2
 _CLAIM_S = 12.0  # a process that was told to stop is usually gone; a child that fails later is tried again
 
 
+_EPILOG = """\
+examples:
+  vical run -c vical.yaml                 everything; then, in another terminal: vical watch
+  vical run imu record -c vical.yaml      record the IMU only
+
+As a service: vical install-service
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = (
-        "as a service: vical install-service; on a laptop: vical run -c vical.yaml, then vical watch"
-    )
+    parser.epilog = _EPILOG
     parser.add_argument(
         "roles",
         metavar="ROLE",
@@ -169,8 +176,8 @@ def _run_children(args: argparse.Namespace, config: Config, names: list[str]) ->
     # Asked before anything starts: record and calibrate would join the bus of the other one.
     if "acquire" in names and reach(socket_path(config.bus)) is Reach.OPEN:
         raise CliError(
-            f"vical runs already: another process hosts the bus at {socket_path(config.bus)}; stop it first "
-            "(systemctl status vical-acquire), or set bus.socket"
+            f"vical is already running: another process hosts the bus at {socket_path(config.bus)}; "
+            "stop it first (systemctl status vical-acquire), or set bus.socket"
         )
     more = [flag for flag in ("--verbose", "--quiet") if getattr(args, flag[2:])]
     file, me = Path(args.config).absolute(), str(os.getpid())

@@ -38,13 +38,13 @@ EPILOG = """examples:
   vical target --type aprilgrid --paper a0 --tag-size 88mm -o board.pdf
   vical target --type checkerboard --cols 8 --rows 7 --square 30mm -o board.svg
   vical target --from board.yaml -o board.pdf                     print an existing target file
+
 Print at 100 %, measure the printed ruler, and correct the target file if it is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.epilog = EPILOG
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--type", choices=("aprilgrid", "checkerboard"), help="kind of board")
     what.add_argument(
@@ -156,7 +156,7 @@ def _must_write(args: argparse.Namespace, yaml_path: Path, target: Target) -> bo
             return False
     if not args.force:
         raise CliError(
-            f"{yaml_path} exists and says something else (sizes that were measured?); choose another name "
+            f"{yaml_path} exists with other contents (measured sizes?); choose another name "
             "with -o or --yaml, print it with --from, or overwrite it with --force"
         )
     return True

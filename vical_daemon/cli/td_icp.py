@@ -14,8 +14,20 @@ if TYPE_CHECKING:
     from vical_daemon.offline.td_icp.request import TdIcpRequest
 
 
+_EPILOG = """\
+examples:
+  vical td-icp log.mcap --target board.yaml
+  vical td-icp tracks/mav0 --initial camchain.yaml        without a board
+  vical td-icp drive.bag --sensors imu0,/odom,/vicon/pose
+  vical td-icp slam.txt mocap.txt                         trajectory files
+
+The sign is Kalibr's: t_imu = t_cam + shift.
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EPILOG
     parser.add_argument(
         "input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a trajectory file"
     )

@@ -44,7 +44,7 @@ def print_single(
     print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
     print(f"  lens         {lens_line(used)}")
     print(f"               {used.origin}")
-    print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
+    print(f"  noise per orientation  {np.rad2deg(result.camera_noise_rad):.3f} deg")
     if result.widened > 1.0:
         print(f"  sigmas widened {_because(result.widened)}")
     for row in watch:
@@ -87,4 +87,4 @@ def print_joint(result: JointResult, lenses: dict[str, LensUsed]) -> None:
 
 
 def _because(widened: float) -> str:
-    return f"{widened:.1f} times, because stretches of the recording disagree (does the delay wander?)"
+    return f"{widened:.1f} times, because stretches of the recording disagree (is the delay constant?)"

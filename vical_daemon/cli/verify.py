@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="test mounting and time shift only, with the lens as given",
     )
     add_stretch(parser)
-    counts = parser.add_argument_group("the smallest changes that count")
+    counts = parser.add_argument_group("smallest relevant changes")
     counts.add_argument(
         "--position-mm", type=float, default=2.0, metavar="MM", help="change of position, mm (default 2)"
     )

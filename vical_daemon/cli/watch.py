@@ -23,9 +23,16 @@ if TYPE_CHECKING:
 _REFRESH_S = 0.25
 
 
+_EPILOG = """\
+examples:
+  vical watch -c vical.yaml
+  vical watch --until-converged --timeout 120 && echo done        in a script
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "in a script: vical watch --until-converged --timeout 120 && echo done"
+    parser.epilog = _EPILOG
     add_config(parser, required=False)
     parser.add_argument(
         "--connect",
@@ -80,9 +87,9 @@ def _loop(args: argparse.Namespace, view: View, end_s: float) -> int:
     if args.once:
         view.print_all()
         if not view.estimates:
-            raise CliError("nothing is calibrating here; is `vical run` (vical.target) up?")
+            raise CliError("nothing is calibrating here; is `vical run` (vical.target) running?")
         return 0
-    raise CliError(f"{args.timeout:g} s are over: {view.where()}")
+    raise CliError(f"{args.timeout:g} s timeout: {view.where()}")
 
 
 class View:
@@ -144,7 +151,7 @@ class View:
             + (f", said {silent[rig, camera]:.0f} s ago and silent since" if (rig, camera) in silent else "")
             for (rig, camera), estimate in sorted(self.estimates.items())
         ]
-        return ", ".join(each) or "nothing is calibrating here; is `vical run` (vical.target) up?"
+        return ", ".join(each) or "nothing is calibrating here; is `vical run` (vical.target) running?"
 
     def print_all(self) -> None:
         """Print the last estimate of each camera, and what does not work."""

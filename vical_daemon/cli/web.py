@@ -101,7 +101,8 @@ def _discover(bus: Bus, stop: threading.Event) -> Config | None:
         if not parsed and not reported:
             reported = True
             print(
-                "vical: waiting: nothing on the bus yet; is `vical run` (vical.target) up?", file=sys.stderr
+                "vical: waiting: nothing on the bus yet; is `vical run` (vical.target) running?",
+                file=sys.stderr,
             )
         if not parsed:
             stop.wait(_RETRY_S)
@@ -109,7 +110,9 @@ def _discover(bus: Bus, stop: threading.Event) -> Config | None:
         return None
     rigs = sorted({entry.rig for entry in parsed})
     if len(rigs) > 1:
-        raise CliError(f"there are the rigs {', '.join(rigs)}: say which with -c FILE", EXIT_USAGE)
+        raise CliError(
+            f"several rigs are on this bus ({', '.join(rigs)}): choose one with -c FILE", EXIT_USAGE
+        )
     about_cameras = (topics.CALIBRATION, topics.CAMERA_INFO, topics.POSE)
     cameras = sorted({entry.name for entry in parsed if entry.topic in about_cameras})
     logging.getLogger(__name__).info("rig %s, cameras %s", rigs[0], ", ".join(cameras) or "none")

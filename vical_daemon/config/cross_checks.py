@@ -30,10 +30,10 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
     if calibration.imu is not None and calibration.imu not in config.imus:
         yield (
             "calibration.imu",
-            f"there is no imu {calibration.imu} (known: {', '.join(config.imus) or 'none'})",
+            f"there is no IMU {calibration.imu} (known: {', '.join(config.imus) or 'none'})",
         )
     if calibration.imu is None and len(config.imus) > 1:
-        yield "calibration", f"several imus; say which with imu: {' or '.join(config.imus)}"
+        yield "calibration", f"several IMUs; choose one with imu: {' or '.join(config.imus)}"
     for i, name in enumerate(calibration.cameras):
         if name not in config.cameras:
             known = ", ".join(config.cameras) or "none"

@@ -1,6 +1,6 @@
-"""The one settings file of a rig: typed, strict, every refusal with path, bound, file and line.
+"""The config file of a rig: typed and strict. Every error names path, bound, file and line.
 
-Defaults stand here and next to the algorithms; `examples/vical.yaml` shows every key.
+Defaults are here and next to the algorithms; `examples/vical.yaml` shows every key.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class ImuConfig:
 class LensConfig:
     """Prior knowledge of a lens and its mounting, with Kalibr's keys.
 
-    `intrinsics_sigma` (px) and `distortion_sigma` say how well a lens is known that `calibration.fix` holds.
+    `intrinsics_sigma` (px) and `distortion_sigma`: uncertainty of a lens that `calibration.fix` fixes.
     """
 
     distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
@@ -148,7 +148,7 @@ class CalibrationConfig:
         mode: target: corners of a board; target_free: tracked features.
         imu: The IMU to calibrate against; None: the only one.
         cameras: Those to calibrate; empty: all.
-        fix: Blocks held at their priors.
+        fix: Blocks kept at their priors.
         estimate: Optional blocks that are always estimated.
         corner_sigma_px: Initial value; measured afterwards.
         gravity_mps2: Magnitude of gravity at the site.
@@ -245,12 +245,12 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Ros2Config:
-    """Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on if this section exists.
+    """Also publish under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on if this section exists.
 
     Attributes:
         namespace: Before every topic, so that robots on one router do not collide; None: the rig's name;
             /: none.
-        domain: ROS_DOMAIN_ID of those who listen.
+        domain: ROS_DOMAIN_ID of the subscribers.
     """
 
     namespace: Annotated[str, Bound(pattern=NAMESPACE, hint=NAMESPACE_HINT)] | None = None

@@ -1,7 +1,8 @@
 """The estimator as the roles see it: measurements in, calibration out. No clock, no thread, no I/O.
 
-Flow: `starting` collects until a start succeeds -> filter everything collected -> follow the stream behind a
-short lag (so that inertial data always bracket each image) -> `evaluator` says how far to trust it.
+Flow: the initializer collects data until an initialisation succeeds -> the filter processes all of them -> it
+follows the stream behind a short lag, so that inertial data always bracket each image -> `evaluator` decides
+the status.
 """
 
 from __future__ import annotations
@@ -81,29 +82,29 @@ class Calibrator:
         self._reports: list[FrameReport] = []  # of the images of a start
 
     def _new_initializer(self, off: Collection[str] = ()) -> Initializer:
-        """For a rig of which it is known what is not as specified."""
+        """Make an initializer that keeps the accepted models (IMU, target)."""
         return Initializer(self.options, self.rig, self._step, off)
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
-        """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
+        """Set the one-sigma uncertainty of the driver's clock mapping, s; implausible values are ignored."""
         if self._intake.stamps_known_to(sigma_s) and self.filter is not None:
             self.filter.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
-        """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
+        """Add one reading (IMU clock, ns; rad/s; m/s^2); old and non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
             self.evaluator.saw_reading(*reading[:3])
         self.evaluator.announce_all(self._intake.imu_news())
 
     @property
     def _buffer(self) -> ImuBuffer:
-        """Readings, once there are any."""
+        """Inertial readings; made with the first one."""
         assert self._intake.buffer is not None
         return self._intake.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
-        """Take the points of one image; those of unknown cameras or off the board are only counted."""
+        """Add the points of one image; those of unknown cameras or off the board are only counted."""
         ok = usable_points(frame) & (frame.ids < len(self.rig.target))
         nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
         if frame.camera not in self.rig.priors or not self._intake.takes_images or nonsense:
@@ -136,7 +137,7 @@ class Calibrator:
             self.watch.shift_reopened()
 
     def do_without(self, cameras: frozenset[str]) -> None:
-        """Wait for none of these cameras: nothing comes from them now."""
+        """Do not wait for these cameras: they send no data now."""
         self.rig.silent = self.evaluator.silent = cameras
 
     @property
@@ -151,7 +152,7 @@ class Calibrator:
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
-        """Do what can be done with what has arrived."""
+        """Process the data that have arrived, as far as possible."""
         if self._intake.buffer is None:
             return []
         if self.filter is None or self.filter.unobservable is not None:
@@ -160,7 +161,7 @@ class Calibrator:
         return self._follow(flush=False)
 
     def finish(self) -> list[FrameReport]:
-        """End of the data: a last attempt to start, and all frames that inertial data cover."""
+        """End of the data: try to initialise a last time, and process all frames that inertial data cover."""
         if self._intake.buffer is None:
             return []
         if self.filter is None:
@@ -170,7 +171,7 @@ class Calibrator:
         return reports + self._follow(flush=True)
 
     def _maybe_start(self, *, at_end: bool = False) -> None:
-        """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
+        """Try to initialise a filter; a full one replaces a partial one."""
         if self.filter is None:
             self._initializer.take(self._pending.take_all())
             self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
@@ -206,7 +207,7 @@ class Calibrator:
             self._begin(found.filter, found)
 
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
-        """Go on from a start: use its images, and then the stream."""
+        """Continue from an initialisation: process its images, then the stream."""
         later = self._pending.take_all()
         f.stamp_sigma_s = self._intake.stamp_sigma_s
         self._stale = None
@@ -221,7 +222,7 @@ class Calibrator:
             self._pending.push(t, frame)
 
     def _take_start(self, f: LinearisedFilter, frames: Frames) -> Frames:
-        """Take the images of a start; return those that readings do not cover yet."""
+        """Process the images of an initialisation; return those that readings do not cover yet."""
         for k, (t_cam_s, frame) in enumerate(frames):
             if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.settled_s:
                 return frames[k:]
@@ -258,12 +259,12 @@ class Calibrator:
         return reports
 
     def _lose_motion(self, *, jumped: bool = False) -> None:
-        """Forget where the rig is, not its calibration; images to come will show it."""
+        """Drop the motion, keep the calibration; the next images re-initialise the motion."""
         self._lost = MotionRestart(self.rig.target, self._used_ns, jumped=jumped)
         self._held_back = HoldoutCheck()
 
     def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
-        """Take the motion anew as soon as images show it, and follow those it was taken from."""
+        """Re-initialise the motion as soon as images determine it, and process these images."""
         f = self.filter
         assert f is not None
         lost.take(frame, t_cam_s, f.state, self._buffer)
@@ -283,7 +284,7 @@ class Calibrator:
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
 
     def _trim(self, needed_s: float) -> None:
-        """Forget readings that nothing will ask for: not those from `needed_s` on."""
+        """Drop readings from before `needed_s`."""
         self._buffer.trim(min(needed_s, self._initializer.oldest_s, self._late.oldest_s) - _KEEP_S)
 
     def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
@@ -302,7 +303,7 @@ class Calibrator:
         return f.update(f.image(frame, t_cam_s, self.rig.target[frame.ids]))
 
     def _one(self, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
-        """Follow one image of the stream; its verdict, or none where it could not be used."""
+        """Process one image of the stream; return its verdict, or None if it could not be used."""
         f = self.filter
         if f is None:  # an image before this one ended it
             return []
@@ -334,13 +335,13 @@ class Calibrator:
         return [report]
 
     def _note(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
-        """Take an image and its verdict into what is remembered and reported."""
+        """Record an image and its verdict."""
         self._used_ns[frame.camera] = frame.t_cam_ns
         self._past.saw(f, report, frame, t_cam_s)
         self.evaluator.saw_frame(report, f)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
-        """Do what the watch over changes asks for."""
+        """Carry out what the change detection requests."""
         f = self.filter
         assert f is not None
         if action.asks and self._part_changed(f, suspect(f, frame)):
@@ -357,7 +358,7 @@ class Calibrator:
             self._restart(f)
 
     def _part_changed(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images no longer fit because something jumped; go on with all of that unknown."""
+        """Test whether a jump explains the misfit of the images; continue with its parts unknown."""
         if f.unobservable is not None:
             return False
         before, fit = self._past.filter(f), None  # images since have moved the present one
@@ -377,7 +378,7 @@ class Calibrator:
         return True
 
     def _part_jumped(self, before: CalibrationFilter, camera: str, *, stepped: bool) -> bool:
-        """See which jump explains the images best, of those that orientations do not show."""
+        """Find the most likely jump among those that orientations do not show."""
         if self._change is not None and self._change.number >= MOST_CHANGES:
             return False
         after_gap = self._change is None and self.watch.motion_is_new(before.state.t_s)
@@ -395,7 +396,7 @@ class Calibrator:
         return True
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> None:
-        """Take a time shift as found again, all else as it is known."""
+        """Set a re-estimated time shift; keep everything else."""
         index = self.rig.layout.cameras[camera].timeshift
         assert index is not None
         f.state.cameras[camera].timeshift_s = fit.timeshift_s
@@ -404,7 +405,7 @@ class Calibrator:
         self.evaluator.reopened(f.state.t_s)
 
     def _restart(self, f: CalibrationFilter) -> None:
-        """Images fit nothing that is known: find everything anew in the data to come."""
+        """Nothing explains the images: start again from new data."""
         if f.unobservable is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._initializer.anew()
@@ -436,17 +437,17 @@ class Calibrator:
 
     @property
     def can_go_on(self) -> bool:
-        """Whether another recording can go on with this calibration: its start left no direction unknown."""
+        """Whether another recording can continue this calibration: no direction is unobservable."""
         return self.filter is not None and self.filter.unobservable is None
 
     def next_recording(self, *, common_clock: bool = True) -> None:
-        """What comes from now on is another recording of the same rig; call `finish` first.
+        """Continue with another recording of the same rig; call `finish` first.
 
-        Mounting, lens, time shift and all else of cameras, imu and target are the same; motion, biases and
-        where the board stands against gravity are new. Where the calibration cannot go on, nothing is kept.
+        Cameras (mounting, lens, time shift), IMU and target are the same; motion, biases and the direction of
+        gravity in the target's frame are new. If the calibration cannot continue, nothing is kept.
 
         Args:
-            common_clock: The time shift is the same, too; else it is found again.
+            common_clock: The time shift is the same, too; otherwise it is estimated again.
         """
         if not self.can_go_on:
             self.filter = None
@@ -475,7 +476,7 @@ class Calibrator:
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
-        """Return what is known now."""
+        """Return the present estimate."""
         self.evaluator.clocks_doubtful = self.watch.doubtful
         estimate = self.evaluator.estimate(self.filter, self._stale)
         return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)

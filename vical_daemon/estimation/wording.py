@@ -29,8 +29,8 @@ def axis_name(axis_cam: Sequence[float]) -> str:
         return _AXIS_NAMES[AXES[order[0]]]
     if size[order[0]] ** 2 + size[order[1]] ** 2 > ALONG**2 and size[order[1]] > _BESIDE:
         first, second = (("x", "y", "optical")[i] for i in sorted(order[:2]))
-        return f"a line between the camera's {first} and {second} axes"
-    return "a line oblique to all axes of the camera"
+        return f"an axis between the camera's {first} and {second} axes"
+    return "an axis oblique to all camera axes"
 
 
 def direction_name(weak: WeakDirection) -> str:
@@ -71,7 +71,7 @@ def guidance_text(guidance: Guidance) -> str:
     if said is not None:
         return said(guidance)
     if guidance.verb is Verb.TURN_AND_MOVE:
-        return "turn the rig about all three axes while moving it to and fro"
+        return "turn the rig about all three axes while moving it back and forth"
     return "rotate " + " and ".join(f"about {_TURNS[axis]}" for axis in guidance.axes) + _whose(guidance)
 
 
@@ -84,17 +84,17 @@ def guidance_caption(guidance: Guidance) -> str:
         Verb.NONE: "",
         Verb.TURN: f"turn about {axes}",
         Verb.TURN_FASTER: f"turn faster, about {axes}",
-        Verb.TURN_TO_AND_FRO: f"turn to and fro, about {axes}",
-        Verb.TURN_AND_MOVE: f"turn about {axes} and move to and fro",
+        Verb.TURN_TO_AND_FRO: f"turn back and forth, about {axes}",
+        Verb.TURN_AND_MOVE: f"turn about {axes} and move back and forth",
     }[guidance.verb]
 
 
 _HEADLINES = {
-    "waiting": "Not begun yet.",
-    "initialising": "Looking for a first solution.",
+    "waiting": "Waiting for data.",
+    "initialising": "Initialising.",
     "converging": "The estimate is improving.",
     "converged": "Converged.",
-    "degenerate": "The motion does not reveal everything yet.",
+    "degenerate": "The motion so far does not determine every direction.",
     "inconsistent": "The data contradict the model: do not use these numbers.",
 }
 
@@ -124,12 +124,12 @@ def fault_headline(component: str, age_s: float | None = None) -> str:
 
 def silent_headline(component: str) -> str:
     """Say in one short sentence that nothing new comes from a device which reports no error."""
-    return f"{component} delivers nothing new."
+    return f"{component} sends no new data."
 
 
 def at_rest(status: str) -> str:
     """Say in one short sentence where a calibration stands while nothing new comes from its devices."""
-    return f"{status}, at rest until data come."
+    return f"{status}, waiting for new data."
 
 
 def silence(age_s: float) -> str:
@@ -151,13 +151,13 @@ def motion_caption(status: str, guidance: Guidance, advice: str) -> str:
     """
     if guidance or advice:
         return guidance_caption(guidance)
-    return "nothing is missing" if status == "converged" else "turn and move freely"
+    return "no more motion needed" if status == "converged" else "turn and move freely"
 
 
 def _still(guidance: Guidance) -> str:
     if guidance.verb is Verb.TURN_TO_AND_FRO:
-        return "without rotation the time shift hardly shows; turn the rig to and fro"
-    return "the rig hardly turns; turn it to and fro about two axes at 20 to 60 deg/s"
+        return "without rotation the time shift is hardly observable; turn the rig back and forth"
+    return "the rig hardly turns; turn it back and forth about two axes at 20 to 60 deg/s"
 
 
 def _slow(guidance: Guidance) -> str:
@@ -190,7 +190,7 @@ _LACKS: dict[Lack, Callable[[Guidance], str]] = {
     Lack.STILL: _still,
     Lack.SLOW: _slow,
     Lack.ONE_AXIS: _one_axis,
-    Lack.STEADY_RATE: lambda _: "the rotation rate hardly changes; turn to and fro instead of steadily round",
+    Lack.STEADY_RATE: lambda _: "the rotation rate hardly changes; turn back and forth, not in one direction",
     Lack.FAST_CHANGES: lambda _: "turn the rig back and forth faster, changing direction",
     Lack.EDGES: _unseen_edges,
 }
@@ -259,7 +259,7 @@ _CAUSES = {
     "or the lens changed",
     Cause.ESTIMATE_IMPLAUSIBLE: "the estimate is not finite",
     Cause.CALIBRATION_CONTRADICTED: "the last seconds move the calibration by more than the sigmas allow",
-    Cause.WINDOW_CONTRADICTED: "the last seconds do not fit the calibration; looking again",
+    Cause.WINDOW_CONTRADICTED: "the last seconds do not fit the calibration; checking again",
     Cause.NO_IMAGES: "no usable images for {:.1f} s",
     Cause.CLOCK_SET: "the camera's clock was set",
     Cause.INERTIAL_GAP: "inertial data have a gap",
@@ -299,7 +299,7 @@ class _Figure:
 def _target_size(event: Event) -> str:
     how = "larger" if (event.value or 0.0) > 0 else "smaller"
     size = _Figure(event, size=True)
-    figure = f"some {size:.0f %}" if event.sigma is None else f"{size:.2f %}"
+    figure = f"about {size:.0f %}" if event.sigma is None else f"{size:.2f %}"
     return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
 
 
@@ -325,12 +325,13 @@ def _imu_noise(event: Event) -> str:
 
 
 def _rolling(event: Event) -> str:
-    shutter = "a rolling shutter"
+    shutter = "rolling shutter"
     if event.kind is EventKind.ROLLING_COLUMNS:
-        shutter += " that reads columns (a phone held upright does)"
+        shutter += " that reads columns (as in a phone held upright)"
     if event.value is None:
-        return f"{shutter}, by how the target is bent in motion: its readout is estimated, too"
-    return f"{shutter}, by how features move: its readout takes {_Figure(event):.1f ms}, and is allowed for"
+        return f"{shutter}, detected from how motion bends the target: its readout is estimated, too"
+    readout = f"readout {_Figure(event):.1f ms}, allowed for from now on"
+    return f"{shutter}, detected from how features move: {readout}"
 
 
 def _cause(event: Event) -> str:
@@ -363,31 +364,32 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     EventKind.TIMESHIFT_CHANGED: _difference("time shift by {:+.2f ms}"),
     EventKind.LENS_CHANGED: _difference("lens by {:.2f px}"),
     EventKind.STORED_HOLDS: "the stored calibration holds, by {:.0f s} of data",
-    EventKind.TIMESHIFT_STEPPED: "the time shift stepped by {:+.1f ms}; all else is kept",
+    EventKind.TIMESHIFT_STEPPED: "the time shift stepped by {:+.1f ms}; the rest is kept",
     EventKind.LENS_STEPPED: "the lens changed, fx by {:+.1f px}: fix focus and zoom; "
-    "a lens that is not fixed is estimated again, all else is kept",
-    EventKind.BIASES_STEPPED: "the biases of the IMU stepped, the gyro's by {:.2f deg/s}: they are found "
-    "again, all else is kept; a shock, warming up, or a gyro that is zeroed at rest",
-    EventKind.POSE_LOST: "the target was moved, or the pose was lost: it is found again, the "
+    "a lens that is not fixed is estimated again, the rest is kept",
+    EventKind.BIASES_STEPPED: "the biases of the IMU stepped, the gyro's by {:.2f deg/s}: they are "
+    "estimated again, the rest is kept; causes: a shock, warming up, or a gyro that is zeroed at rest",
+    EventKind.POSE_LOST: "the target was moved, or the pose was lost: it is estimated again, the "
     "calibration is kept",
     EventKind.CLOCK_DRIFT: "the time shift drifts: the clocks of camera and IMU run at different rates, by "
-    "{:+.1f us a second}; it is now estimated too",
+    "{:+.1f us per second}; it is now estimated too",
     EventKind.CLOCK_WANDER: "the time shift is not constant: it stepped, or the clocks of camera and IMU "
-    "changed their rates, which now differ by {:+.1f us a second}; the drift is now estimated too",
+    "changed their rates, which now differ by {:+.1f us per second}; the drift is now estimated too",
     EventKind.STAMP_JITTER: "the stamps of the images jitter by {:.1f ms}; allowed for",
     EventKind.STAMPED_ON_ARRIVAL: "its stamps jitter by {:.1f ms} but it samples evenly: its images are put "
     "on an even grid from now on; the calibration starts over",
-    EventKind.IMAGES_WANDER: "whole images move by {:.1f px} against the motion of the IMU: switch off "
-    "image stabilisation; lens, camera and board must not move on their own",
-    EventKind.TIMESHIFT_VARIES: "the time shift varies by {:.1f ms} within seconds: hold the exposure, or "
-    "stamp the middle of exposures",
-    EventKind.STAMPS_STEPPED: "its stamps stepped by about {:+.1f s} against those of the IMU",
+    EventKind.IMAGES_WANDER: "whole images move by {:.1f px} relative to the motion of the IMU: switch off "
+    "image stabilisation; neither lens, camera nor board may move by itself",
+    EventKind.TIMESHIFT_VARIES: "the time shift varies by {:.1f ms} within seconds: fix the exposure time, "
+    "or stamp the middle of exposures",
+    EventKind.STAMPS_STEPPED: "its stamps stepped by about {:+.1f s} relative to those of the IMU",
     EventKind.IMU_CLOCK_SET_BACK: "the IMU's stamps went back by {:.1f s}: its clock was set",
     EventKind.IMU_CLOCK_REMAPPED: "the IMU's stamps moved by {:+.1f ms}: its driver mapped the clock again; "
     "corrected for",
     EventKind.IMU_GAP: "{:.1f s} without inertial data",
     EventKind.IMU_REPEATED: "{:.1f s} in which the IMU repeated one reading",
-    EventKind.IMU_CLIPPED: "{:.1f %} of the readings are at the range of the IMU: move the rig more gently",
+    EventKind.IMU_CLIPPED: "{:.1f %} of the readings are at the limit of the IMU's range: "
+    "move the rig more gently",
     EventKind.IMAGE_GAP: "{:.1f s} without images",
     EventKind.IMAGE_REPEATED: "{:.1f s} in which one image was repeated",
     EventKind.IMU_NOISE: _imu_noise,
@@ -405,7 +407,7 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated",
     EventKind.ROLLING_SHUTTER: _rolling,
     EventKind.ROLLING_COLUMNS: _rolling,
-    EventKind.LENS_TERM_MISSING: "the lens needs one term more than radtan has: give it "
+    EventKind.LENS_TERM_MISSING: "the lens needs one more term than radtan has: set "
     "distortion_model: plumb_bob",
     EventKind.DEVICE_REPLACED: lambda e: e.said,
     EventKind.ESTIMATOR_RESTARTED: lambda e: e.said,

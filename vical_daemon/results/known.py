@@ -144,7 +144,7 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
             covariance[6, 6] = max(covariance[6, 6], camera.timeshift_sigma_s**2)
     elif camera.covariance is not None:
         covariance, inflation = _of_blocks(camera, size)
-        notes = (f"{source}: no correlations between pose, time and lens; bounded, not known",)
+        notes = (f"{source}: no correlations between pose, time shift and lens; vical bounds their effect",)
     return _completed(
         KnownCamera(
             camera.name,

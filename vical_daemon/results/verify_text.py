@@ -30,10 +30,10 @@ def describe(document: dict[str, Any], against: str) -> str:
 def _headline(document: dict[str, Any], against: str) -> str:
     verdict, probability = document["verdict"], document["probability_changed"]
     if verdict == "holds":
-        return f"{against} holds (a change that counts is missed with a probability below {MISSED:g})"
+        return f"{against} holds (a relevant change is missed with a probability below {MISSED:g})"
     if verdict == "changed":
         moved = ", ".join(dict.fromkeys(change["what"] for change in document["changes"]))
-        return f"{against} no longer holds: {moved} (false alarms: below {FALSE_ALARM:g})"
+        return f"{against} no longer holds: {moved} (false-alarm probability below {FALSE_ALARM:g})"
     chance = "" if probability is None else f", probability of a change {probability:.2g}"
     return f"cannot tell whether {against} holds{chance}"
 
@@ -51,9 +51,9 @@ def change_text(change: dict[str, Any]) -> str:
 
 
 def _block(block: str, row: dict[str, Any]) -> str:
-    word = "holds" if row["holds"] else "does not hold, or not known yet"
-    return f"{block + ':':<12}{word}; changes count from {_size(row, 'counts_from')} on" + (
-        "" if row["holds"] else f", and show from {_size(row, 'visible_from')} on"
+    word = "holds" if row["holds"] else "does not hold, or undecided"
+    return f"{block + ':':<12}{word}; smallest relevant change: {_size(row, 'counts_from')}" + (
+        "" if row["holds"] else f", smallest visible change: {_size(row, 'visible_from')}"
     )
 
 

@@ -1,4 +1,4 @@
-"""From a URI to an open camera; what there is to open. Libraries are loaded when they are used."""
+"""Opens cameras by URI, and lists them. Libraries are loaded when they are used."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def open_camera(
         uri: See the table of this package.
         width: Pixels; with `height`.
         height: Pixels.
-        rate_hz: Frames a second.
+        rate_hz: Frames per second.
         pixel_format: See `CameraSettings`, as the rest; `info.details` says what was obtained.
         encoding: mono8, mono16 or bgr8.
         exposure_s: Exposure time, s; turns automatic exposure off.
@@ -119,7 +119,7 @@ _SOURCES = {"v4l2": _open_v4l2, "iidc": _open_iidc, "aravis": _open_aravis, "fol
 
 
 def list_cameras(*, kernel: Kernel | None = None, schemes: tuple[str, ...] = SCHEMES) -> list[DeviceInfo]:
-    """Return the cameras that are there; `details["uri"]` is what `open_camera` takes.
+    """Return the connected cameras; `details["uri"]` is what `open_camera` takes.
 
     A kind whose library is missing is skipped; where there is a FireWire bus, the log says what to install.
     """
@@ -149,7 +149,7 @@ def _list_by_library(scheme: str) -> list[DeviceInfo]:
 
 
 def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str]:
-    """Open a camera as configured, take one frame, and return what is not as asked, in words.
+    """Open a camera as configured, take one frame, and describe what differs from the settings.
 
     Args:
         uri: See `open_camera`.
@@ -157,7 +157,7 @@ def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str
         wanted: What `open_camera` takes.
 
     Returns:
-        One line a problem; [] when all is well.
+        One line for each problem; [] if there is none.
     """
     try:
         source = open_camera(uri, **wanted)

@@ -22,7 +22,7 @@ class CameraSettings:
     Attributes:
         width: Pixels; given together with `height`.
         height: Pixels.
-        rate_hz: Frames a second.
+        rate_hz: Frames per second.
         pixel_format: What travels from the camera: a V4L2 four-character code, an IIDC coding
             (mono8, mono16, raw8) or a GenICam name; None: the cheapest that gives `encoding`.
         encoding: What frames hold: mono8, mono16 or bgr8.

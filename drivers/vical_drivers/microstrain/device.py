@@ -59,11 +59,11 @@ def open_imu(
         port: Path of the serial port; ``/dev/serial/by-id/...`` survives a replug.
         protocol: "single-byte", "mip", or "auto": whichever is answered.
         rate_hz: Samples per second; the nearest rate the device can divide to is taken.
-        filter_width: M of the GX3's moving average, 1 .. 32 ms; its delay is taken off the stamps. None: as
-            long as a sample lasts, so that averages neither overlap nor leave gaps.
-        baud: Bits a second for streaming; None: as found, or more where the rate needs it. Temporary.
-        link: What lies in between: "auto", "usb", "ftdi" or "uart"; decides whether bytes take wire time.
-        reconnect: Come back by itself after an unplug.
+        filter_width: M of the GX3's moving average: 1 .. 32 ms; its delay is subtracted from stamps. None:
+            one sample interval, so that averages neither overlap nor leave gaps.
+        baud: Bits per second for streaming; None: as found, or more where the rate needs it. Temporary.
+        link: Kind of link: "auto", "usb", "ftdi" or "uart"; decides whether bytes take wire time.
+        reconnect: Reconnect automatically after an unplug.
         warm_up_s: The first samples are held back this long, then all delivered, none lost.
         silence_s: A stream without samples for this long counts as lost; pauses of the host do not count.
 
@@ -132,7 +132,7 @@ class MicrostrainImu(Closing):
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
 
     def _connect(self) -> tuple[Session, SerialPort]:
-        """Find the device; one that is known is looked for where it was."""
+        """Find the device; a known one with its last settings first."""
         o, known = self._options, self._known
         if known is None:
             return connect(self._path, o.protocol, o.link, self._settings.baud)
@@ -143,7 +143,7 @@ class MicrostrainImu(Closing):
         return connect(self._path, o.protocol, o.link, bauds=[other], patient=False)
 
     def _expect(self, info: DeviceInfo) -> None:
-        """Refuse to go on with another device: clock, counters and calibration are not its own."""
+        """Refuse another device: clock, counters and calibration belong to the first one."""
         known = self._known
         if known is None or (info.serial_number, info.model) == (known.serial_number, known.model):
             return
@@ -195,7 +195,7 @@ class MicrostrainImu(Closing):
             raise DeviceTimeoutError(f"{self._path}: the stream went silent; check power and cable")
 
     def _drop(self) -> None:
-        """Give up the present connection; counters go on."""
+        """Close the present connection; keep the counters."""
         if self._session is not None:
             self._past_checksum_errors += self._session.checksum_errors
             self._past_skipped_bytes += self._session.skipped_bytes

@@ -49,7 +49,7 @@ class BytePort(Protocol):
 
     @property
     def baud(self) -> int:
-        """Bits a second on the line as set on this side."""
+        """Bits per second on the line as set on this side."""
         ...
 
     @property
@@ -117,7 +117,7 @@ class SerialPort:
 
     Args:
         path: Device path; a link such as ``/dev/serial/by-id/...`` is best, it survives a replug.
-        baud: Bits a second.
+        baud: Bits per second.
         link: "auto", or "usb", "ftdi", "uart" where the guess of `link_of` is wrong. Only on a real UART
             (everything but "usb" and "unknown") do the bytes take time, which the stamps take off.
 
@@ -173,7 +173,7 @@ class SerialPort:
 
     @property
     def baud(self) -> int:
-        """Bits a second on the line as set on this side."""
+        """Bits per second on the line as set on this side."""
         return int(self._serial.baudrate)
 
     @property

@@ -39,7 +39,7 @@ class ImuSettings:
         rate_hz: Samples per second; the device divides its own base rate by whole numbers.
         filter_width: M of the moving average on gyro and accelerometer (GX3), 1 .. 32 ms; None: as long as
             a sample lasts.
-        baud: Bits a second wanted on the line; None: as found, or more where the rate needs it.
+        baud: Bits per second wanted on the line; None: as found, or more where the rate needs it.
     """
 
     rate_hz: float = 100.0

@@ -225,7 +225,7 @@ def test_in_a_browser(fed, browser, tmp_path):
     marks, misfit, status, lever, drawn, devices, outside, errors = browser.drive(script)
     assert errors == []
     assert marks  # detected and predicted
-    assert misfit.startswith("48 corners, half of them within 0.")
+    assert misfit.startswith("48 corners, median error 0.")
     assert status
     assert lever.startswith("x")
     assert "±" in lever
@@ -252,7 +252,7 @@ def test_a_calibration_that_stops_is_stale_in_a_browser(served, browser, web_fee
     assert "No estimate for" in words
     assert "silent for" in words  # of the devices
     assert "Converged:" not in words
-    assert "nothing is missing" not in words
+    assert "no more motion needed" not in words
 
 
 def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
@@ -378,7 +378,7 @@ def check_what_stands_there(scene, reason, texts):
         assert texts["headline"].startswith("Converged, except") and texts["edges"] == 2
         assert "show the target near" in texts["motiontext"]
     else:
-        assert (texts["headline"], texts["motiontext"]) == ("Converged.", "nothing is missing")
+        assert (texts["headline"], texts["motiontext"]) == ("Converged.", "no more motion needed")
         assert texts["guidance"] == "" and texts["edges"] == 0
 
 

@@ -161,7 +161,7 @@ def test_a_command_is_for_the_rig_of_the_config():
     status = encode_diagnostics(1, "record", [DiagnosticStatus(Level.OK, "record", "")])
     bus.publish(topics.STATUS.key("robot1", "record"), status)
     assert command._rig(bus, "") == command._rig(bus, "robot1") == "robot1"
-    with pytest.raises(CliError, match="the rig robot2 is not on this bus, only robot1"):
+    with pytest.raises(CliError, match="rig robot2 is not on this bus, only robot1"):
         command._rig(bus, "robot2")
 
 

@@ -94,7 +94,7 @@ def test_a_second_run_starts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with socket.socket(socket.AF_UNIX) as other:
         other.bind(config.bus.socket)
         other.listen()
-        with pytest.raises(CliError, match="vical runs already"):
+        with pytest.raises(CliError, match="vical is already running"):
             run._run_children(arguments, config, ["acquire", "record"])
 
 

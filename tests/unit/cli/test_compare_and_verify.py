@@ -147,7 +147,7 @@ def test_compare_other_cameras_cannot_be_compared(tmp_path, rig, write, capsys):
 @pytest.mark.parametrize(
     ("args", "code", "line"),
     [
-        (["compare", "one.json"], 2, "two calibrations are compared, 1 are named"),
+        (["compare", "one.json"], 2, "compare takes two calibrations, not 1"),
         (["compare", "a", "b", "--report", "none/p.html"], 2, "--report: the folder of none/p.html does not"),
         (["compare", "none.json", "none.json"], 1, "none.json: no such file"),
         (["compare", "a", "b", "--distance", "-1"], 2, "--distance must be above 0 m"),

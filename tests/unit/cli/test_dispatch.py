@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -222,3 +223,22 @@ def test_log_lines_carry_the_time_where_no_journal_adds_it(journal: bool) -> Non
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     expected = "I vical_daemon.x: hello" if journal else r"\d\d:\d\d:\d\d I vical_daemon.x: hello"
     assert re.fullmatch(expected, done.stderr.strip())
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+@pytest.mark.parametrize("name", [None, *table.COMMANDS], ids=lambda c: c.name if c else "vical")
+def test_help_fits_the_terminal(
+    name: table.Command | None,
+    columns: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    words = [name.name] if name else []
+    with contextlib.suppress(SystemExit):
+        cli.main([*words, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    lines = lines[lines.index("") :]  # argparse breaks no line of the usage within a group
+    assert len(lines) > 5
+    too_long = [line for line in lines if len(line) > columns]
+    assert all(line.startswith("  vical ") for line in too_long), too_long  # examples, to be copied

@@ -264,7 +264,7 @@ def test_units_and_motion_are_noticed(tmp_path, capsys):
     moving = 0.5 * np.sin(np.arange(2000) / 30.0)[:, None] * np.ones(3)
     code, error = allan(moving, down)
     assert code == 1
-    assert "never rests for 10 s" in error
+    assert "is never at rest for 10 s" in error
     moving[700:1900] = 0.0
     code, error = allan(moving, down)
     assert code == 0

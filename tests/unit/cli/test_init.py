@@ -35,7 +35,7 @@ def computer(tmp_path, monkeypatch):
 def test_nothing_plugged_in_is_said_and_the_emulated_rig_offered(computer, capsys) -> None:
     assert main(["init"]) == 1
     err = capsys.readouterr().err
-    assert "neither IMU nor camera" in err and "vical init --emulated" in err
+    assert "no IMU and no camera" in err and "vical init --emulated" in err
     assert not Path("vical.yaml").exists()
 
 

@@ -37,7 +37,7 @@ def test_a_measured_board_is_not_overwritten(tmp_path: Path, capsys: pytest.Capt
     capsys.readouterr()
     assert main(words) == 1
     err = capsys.readouterr().err
-    assert "board.yaml exists and says something else" in err and "--force" in err and err.count("\n") == 1
+    assert "board.yaml exists with other contents" in err and "--force" in err and err.count("\n") == 1
     assert "0.01987" in measured.read_text() and not (tmp_path / "board.pdf").exists()
     assert main([*words, "--force"]) == 0
     assert "0.01987" not in measured.read_text()
@@ -52,7 +52,7 @@ def test_a_measured_board_is_not_overwritten(tmp_path: Path, capsys: pytest.Capt
         ("target --type aprilgrid --cols 5 -o b.pdf", "--cols is for checkerboard, not for aprilgrid"),
         ("target --type aprilgrid --tag-size 2 -o b.pdf", "a4 has 210 x 297"),
         ("target --type aprilgrid -o b.png", "must end in .pdf or .svg"),
-        ("demo --web 99999", "--web 99999: a port lies between 0 and 65535"),
+        ("demo --web 99999", "--web 99999: a port must be 0 to 65535"),
         ("demo --seconds 1", "--seconds: 5 to 3600"),
     ],
 )

@@ -110,7 +110,7 @@ def test_a_pipe_gets_a_line_when_a_component_fails_and_when_it_is_back(bus: Loca
 
 def test_nothing_there_is_one_line(bus: LocalBus, capsys) -> None:
     assert main(["watch", "--once", "--timeout", "0.3"]) == 1
-    assert "is `vical run` (vical.target) up?" in capsys.readouterr().err
+    assert "is `vical run` (vical.target) running?" in capsys.readouterr().err
 
 
 def test_until_converged_waits_for_every_camera_of_the_rig(bus: LocalBus, capsys) -> None:
@@ -191,7 +191,7 @@ def test_the_screen_shows_cameras_and_health() -> None:
     assert "turn about x" in [line.strip() for line in text.splitlines()]  # a line of its own, not cut off
     assert "<svg" in console.export_svg(title="vical watch")
     console.print(live_table.screen({}, {}))
-    assert "is `vical run` (vical.target) up?" in console.export_text()
+    assert "is `vical run` (vical.target) running?" in console.export_text()
 
 
 def _result(p_m: Any, rotation: Rotation, shift_s: float, sigma: float) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("target: board.yaml", "calibration: {}", "calibration.mode: target needs `target: FILE` (`vical target` makes one), or mode: target_free (config line 11)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [lens]}", "calibration.fix.0: the text 'lens' is none of intrinsics, timeshift, extrinsics (config line 12)"),
-        ("target: board.yaml", "target: b.yaml\ncalibration: {imu: imu1}", "calibration.imu: there is no imu imu1 (known: imu0) (config line 12)"),
+        ("target: board.yaml", "target: b.yaml\ncalibration: {imu: imu1}", "calibration.imu: there is no IMU imu1 (known: imu0) (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {commanders: [anna]}", "bus.commanders: clients cannot prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {publishers: [anna], tls_ca: ca.pem}", "bus.publishers: clients cannot prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {readers: everybody}", "bus.readers: the text 'everybody' is none of group, loopback (config line 12)"),

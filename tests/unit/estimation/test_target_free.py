@@ -214,7 +214,7 @@ def test_a_fixed_lens_that_is_not_this_cameras_is_announced_and_its_errors_are_i
     last = record.snapshots[-1]
     assert nees(last.error, last.covariance, 7) < chi2.isf(1e-3, 7)
     assert last.status == "converging"
-    assert "the fixed lens of cam0 is not this camera's: leave it free" in record.statuses[-1][2]
+    assert "the fixed lens of cam0 is not this camera's: estimate it" in record.statuses[-1][2]
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
@@ -281,7 +281,7 @@ def test_standing_still_gives_no_answer_and_says_what_to_do():
     assert record.snapshots == []
     assert record.statuses[-1][1] == "degenerate"
     assert "stands still" in record.statuses[-1][2]
-    assert "turn it to and fro" in record.guidance
+    assert "turn it back and forth" in record.guidance
 
 
 @pytest.mark.parametrize("seed", [42, 405], ids=["features soon lost", "narrow lens"])

@@ -87,7 +87,7 @@ def test_another_size_is_tried_only_where_the_one_in_the_file_does_not_fit(monke
     ("seed", "columns", "lens_known"), [(1, 1.11, False), (2, 1.11, True), (3, 1.03, False), (4, 0.9, False)]
 )
 def test_columns_further_apart_than_stated_are_told_and_every_answer_is_right(seed, columns, lens_known):
-    """At 11 % there was no start: `the delay is not determined, turn to and fro`, whatever the motion."""
+    """At 11 % there was no start: `the delay is not determined, turn back and forth`, whatever the motion."""
     record, _ = calibrated(seed, np.array([columns, 1.0, 1.0]), lens_known=lens_known)
     kinds = [event.kind for _, event in record.events]
     (event,) = (event for _, event in record.events if event.kind is EventKind.TARGET_RATIO)

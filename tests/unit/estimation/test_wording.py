@@ -59,21 +59,21 @@ def test_every_cause_has_a_text(cause):
         ),
         (
             Event(EventKind.TIMESHIFT_STEPPED, "cam0", 0.0201),
-            "cam0: the time shift stepped by +20.1 ms; all else is kept",
+            "cam0: the time shift stepped by +20.1 ms; the rest is kept",
         ),
         (
             Event(EventKind.BIASES_STEPPED, value=0.0148),
-            "the biases of the IMU stepped, the gyro's by 0.85 deg/s: they are found again, all else is "
-            "kept; a shock, warming up, or a gyro that is zeroed at rest",
+            "the biases of the IMU stepped, the gyro's by 0.85 deg/s: they are estimated again, the rest "
+            "is kept; causes: a shock, warming up, or a gyro that is zeroed at rest",
         ),
         (
             Event(EventKind.CLOCK_DRIFT, "cam0", -5e-5, 1e-6),
             "cam0: the time shift drifts: the clocks of camera and IMU run at different rates, "
-            "by -50.0 ± 1.0 us a second; it is now estimated too",
+            "by -50.0 ± 1.0 us per second; it is now estimated too",
         ),
         (
             Event(EventKind.TARGET_SIZE, value=-0.03),
-            "the target is some 3 % smaller than stated: measure it; its size is estimated from now on",
+            "the target is about 3 % smaller than stated: measure it; its size is estimated from now on",
         ),
         (
             Event(EventKind.WENT_ON, "cam0", cause=Cause.NO_IMAGES, cause_value=2.04),
@@ -91,7 +91,10 @@ def test_guidance_and_the_caption_of_the_picture_name_the_same_axes():
     assert guidance_text(weak) == "rotate about the image's x axis (nod) and about the image's y axis (shake)"
     assert guidance_caption(weak) == "turn about x and y"
     assert guidance_text(Guidance()) == guidance_caption(Guidance()) == ""
-    assert guidance_caption(Guidance(Verb.TURN_AND_MOVE, AXES)) == "turn about x, y and z and move to and fro"
+    assert (
+        guidance_caption(Guidance(Verb.TURN_AND_MOVE, AXES))
+        == "turn about x, y and z and move back and forth"
+    )
     show = Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left", "top"))
     assert "near the left and top edges of cam0's picture" in guidance_text(show)
     assert guidance_caption(show) == "show the target near the left and top edges of the image"

@@ -255,7 +255,7 @@ def test_nothing_is_missing_is_said_only_where_nothing_is(bus, state, web_feed):
     assert "nothing" not in entry["motion"]["caption"]
     web_feed.publish_estimate(bus, web_feed.estimate(30.2, rng, Status.CONVERGED))
     entry = state.tick()["cameras"]["cam0"]
-    assert (entry["headline"], entry["motion"]["caption"]) == ("Converged.", "nothing is missing")
+    assert (entry["headline"], entry["motion"]["caption"]) == ("Converged.", "no more motion needed")
     # a message of version 0.1.0 has guidance as text alone
     old = web_feed.estimate(30.4, rng, Status.CONVERGED, guidance="no corners yet near the left edge")
     web_feed.publish_estimate(bus, old)
@@ -297,8 +297,8 @@ def test_a_device_that_repeats_itself_is_a_fault_though_it_reports_none(bus, sta
     silent = DiagnosticStatus(Level.WARN, "estimate", "converged 100%", values={"silent": "camera/cam0"})
     bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [silent]))
     fault = state.tick()["cameras"]["cam0"]["fault"]
-    assert fault["headline"] == "camera/cam0 delivers nothing new." and fault["message"] == reason
-    assert state.tick()["cameras"]["cam0"]["headline"] == "converged, at rest until data come."
+    assert fault["headline"] == "camera/cam0 sends no new data." and fault["message"] == reason
+    assert state.tick()["cameras"]["cam0"]["headline"] == "converged, waiting for new data."
     spoken = replace(silent, values={"silent": ""})
     bus.publish(topics.STATUS.key("rig0", "estimate"), encode_diagnostics(0, "estimate", [spoken]))
     assert state.tick()["cameras"]["cam0"]["fault"] is None

@@ -1,7 +1,7 @@
 """The filter: square-root sigma-point propagation with the IMU and update with the points of one image.
 
-Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to believe a result; that is
-`StatusEvaluator`. The filter never raises on data: each update returns a verdict.
+Equations and derivation: docs/math/filter.md. `StatusEvaluator` decides the status of a result. The
+filter never raises on data: each update returns a verdict.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class CalibrationFilter:
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
         unobservable: After a partial start: axes along which lever arms are not known.
-        absent: Cameras that have not seen the target: their errors stand for nothing.
+        absent: Cameras that have not seen the target: their errors have no meaning yet.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         wandered: When their drift was found to be another, s, and its values, s/s.
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
@@ -146,9 +146,9 @@ class CalibrationFilter:
         self.rates = rates_after(state, segment, self.rates)
 
     def doubt_motion(self) -> None:
-        """Before a gap in the images, widen the motion by what their lasting errors add to its variance.
+        """Before a gap in the images, inflate the motion's covariance for lasting image errors.
 
-        The covariance takes errors of the images for independent. From image to image that hardly matters;
+        The covariance assumes that image errors are independent. From image to image that hardly matters;
         over a gap of a second a wrong velocity moves all corners.
         """
         more = max((c.factor for c in self.consistency.values()), default=1.0) - 1.0
@@ -164,7 +164,7 @@ class CalibrationFilter:
             self.arm_score.predict(moved.slopes, Q, walk)
 
     def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
-        """The motion at the end of a segment and the covariance of the noise gathered on the way."""
+        """Motion at the end of a segment, and covariance of the process noise."""
         d = self.layout.dynamic
         S = self.S[:d, :d]
         sigmas = np.sqrt(np.vecdot(S, S))
@@ -180,7 +180,7 @@ class CalibrationFilter:
         return moved, Q
 
     def _noise(self, influence: Influence) -> FloatArray:
-        """Covariance of the noise gathered on the way, shape (9, 9)."""
+        """Covariance of the process noise, shape (9, 9)."""
         return influence.noise(self.imu_noise) + ROUNDING
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
@@ -197,7 +197,7 @@ class CalibrationFilter:
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
-        """Correct the state with the points of one image; the verdict says what became of it."""
+        """Correct the state with the points of one image; return the verdict."""
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
         innovation = image.uv - lin.z
@@ -250,7 +250,7 @@ class CalibrationFilter:
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
-        """What residuals gain where lenses that are held are taken as given, px, shape (n, 2), or 0."""
+        """Contribution of a fixed lens's errors to the residuals, px, shape (n, 2), or 0."""
         if not self.layout.held:
             return np.zeros(())
         lenses = self.layout.held.items()
@@ -266,11 +266,11 @@ class CalibrationFilter:
         return np.asarray(moved.reshape(-1, 2))
 
     def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
-        """Which corners are where they may be expected, shape (n,)."""
+        """Corners that pass their gate, shape (n,)."""
         return corner_gate(image, innovation, lin)
 
     def _misses_gate(self, fit: ImageFit) -> bool:
-        """Whether a whole image is not where it may be expected."""
+        """Whether a whole image misses its gate."""
         return fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level)
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
@@ -284,7 +284,7 @@ class CalibrationFilter:
         return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
-        """Put a measurement together with the noise it has at present."""
+        """Make a measurement with the present noise."""
         name, scale = frame.camera, self.consistency[frame.camera].scale
         sigma = self.corner_noise[name].sigmas(frame.sigma_px, len(frame.ids)) * math.sqrt(scale)
         return Image(name, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, scale)
@@ -339,7 +339,7 @@ class CalibrationFilter:
         self.state = retract(self.state, self.layout, dx)
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
-        """What this image adds wrongly to the information vector, see `LeverArmScore.update`."""
+        """Bias that this image adds to the information vector, see `LeverArmScore.update`."""
         if self.arm_score is None:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
@@ -362,7 +362,7 @@ class CalibrationFilter:
         return score
 
     def allowing_for_arm_bias(self) -> CalibrationFilter:
-        """The filter with sigmas that allow for what is not known of the bias that was subtracted.
+        """The filter with sigmas that include the uncertainty of the subtracted bias.
 
         Its `S` has one column more, the first: the last may be that of `model_mixture.joined`.
         """
@@ -387,27 +387,27 @@ class CalibrationFilter:
         return math.isfinite(sum(float(x.sum()) for x in values))  # of infinite terms no sum is finite
 
     def forget(self, index: int, sigma: float) -> None:
-        """Take one error as known to `sigma` only, whatever the rest says about it."""
+        """Set one error's sigma to `sigma`, independent of the others."""
         self.S = self.S.copy()  # `passed` refers to it
         self.S[index] = 0.0
         self.reopen(index, sigma)
 
     def reopen(self, index: int, sigma: float) -> None:
-        """Add independent uncertainty to one error: what was known about it is in doubt."""
+        """Add independent uncertainty to one error."""
         column = np.zeros(self.layout.size)
         column[index] = sigma
         self.inflate_covariance(column)
 
     def inflate_covariance(self, columns: FloatArray) -> None:
-        """Add the covariance `columns columns'`: directions of the errors, shape (n,) or (n, k), in doubt."""
+        """Add the covariance `columns columns'`; directions of the errors, shape (n,) or (n, k)."""
         added = columns.reshape(self.layout.size, -1)
         self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
 
     def restart_motion(self, motion: MotionStart) -> None:
-        """Take the motion from elsewhere and keep the calibration, which ages until then.
+        """Replace the motion and keep the calibration, with process noise up to that time.
 
         Args:
-            motion: Where the rig is, independent of all that the filter knows; of another recording also its
+            motion: The new motion, independent of the filter's state; of another recording also its
                 biases and gravity.
         """
         state, dt, root = self.state, motion.elapsed_s, np.diag(motion.sigmas)
@@ -436,7 +436,7 @@ class CalibrationFilter:
             consistency.settle()
 
     def _turn_gravity(self, turned: FloatArray) -> None:
-        """The target seems to have turned, shape (3, 3), against gravity; or it is the imu that did."""
+        """Turn gravity with the target, shape (3, 3); the IMU may have turned instead."""
         state, in_doubt = self.state, np.zeros((self.layout.size, 3))
         state.gravity = turned @ state.gravity
         in_doubt[GRAVITY] = gravity_root(state.gravity, float(np.linalg.norm(so3.log(turned))), 0.0)
@@ -468,7 +468,7 @@ class CalibrationFilter:
                 A[where.timeshift] += dt * S[where.skew]
 
     def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
-        """A filter that can be run ahead of this one; what is measured about the noise stays shared.
+        """A filter that can run ahead of this one; both share the measured noise.
 
         Args:
             earlier: A copy that was run as far ahead before: the same derivatives will do as long as its

@@ -17,7 +17,7 @@ def blamed(held: CameraState, other: CameraState) -> str:
     return (
         f"the fixed lens (fx {held.intrinsics[0]:.0f} px) is not this camera's: with fx "
         f"{other.intrinsics[0]:.0f} px and its own distortion images and gyro agree; "
-        "correct it or leave it free"
+        "correct it, or let vical estimate it"
     )
 
 

@@ -109,7 +109,7 @@ class TargetFreeInitializer:
         self.attempts.tried(end_s)
         self.motion_missing = True
         if _still(usable):
-            return "the camera stands still: move the rig to and fro while turning it"
+            return "the camera stands still: move the rig back and forth while turning it"
         return usable
 
     def window(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior | None) -> Window | str:

@@ -141,12 +141,12 @@ class TargetFreeStatus(Evaluator):
         self._growing = 0.0, 0
 
     def stepped(self, step_s: float) -> None:
-        """The time shift stepped, s; all else is kept."""
+        """The time shift stepped, s; the rest is kept."""
         self.announce(Event(EventKind.TIMESHIFT_STEPPED, self.camera, step_s))
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
     def biases_stepped(self, gyro_rps: float) -> None:
-        """The biases of the imu stepped, the gyro's by so much, rad/s; all else is kept."""
+        """The biases of the imu stepped, the gyro's by so much, rad/s; the rest is kept."""
         self.announce(Event(EventKind.BIASES_STEPPED, value=gyro_rps))
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 

@@ -143,7 +143,7 @@ class TrackStart:
         found = self._solve(self.camera.R_imu_cam, arm, ROUNDS)
         if found is None:
             raise NoStartError(
-                "speed and scale are not visible yet: move the rig to and fro while turning it"
+                "speed and scale are not visible yet: move the rig back and forth while turning it"
             )
         z, gravity = found.z, found.gravity
         if not np.isfinite(z).all():

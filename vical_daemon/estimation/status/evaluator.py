@@ -354,7 +354,7 @@ def lens_known(e: CameraEstimate) -> CameraEstimate:
 def lens_verdict(worst: WeakDirection, camera: str, *, off: bool) -> Verdict:
     """The verdict where nothing is missing but for a fixed lens; `off`: images contradict it."""
     how = "not this camera's" if off else "not known better"
-    text = f"{direction_sigma(worst)}: the fixed lens of {camera} is {how}: leave it free"
+    text = f"{direction_sigma(worst)}, because the fixed lens of {camera} is {how}: estimate it"
     return Verdict(Status.CONVERGING, text)
 
 

@@ -40,7 +40,7 @@ from vical_daemon.estimation.status.mounting_changes import (
 from vical_daemon.estimation.wording import not_in_view
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
-SHIFT_VARIES = "the time shift varies within seconds: hold the exposure, or stamp the middle of exposures"
+SHIFT_VARIES = "the time shift varies within seconds: fix the exposure time, or stamp the middle of exposures"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one

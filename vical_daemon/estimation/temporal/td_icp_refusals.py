@@ -189,7 +189,7 @@ def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, option
     if rate_cam < MIN_RATE_RPS and swing < MIN_RATE_RPS:
         return Refusal(
             f"no motion: the camera turns at {np.rad2deg(rate_cam):.1f} deg/s (median); "
-            "turn the rig to and fro about all axes at 20 to 60 deg/s",
+            "turn the rig back and forth about all axes at 20 to 60 deg/s",
             still=True,
         )
     if rate_cam < MIN_RATE_RPS and swing > 5.0 * MIN_RATE_RPS:
@@ -199,7 +199,7 @@ def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, option
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return Refusal(
             f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither "
-            "delay nor mounting about that axis show; turn to and fro, and about other axes"
+            "delay nor mounting about that axis show; turn back and forth, and about other axes"
         )
     return Refusal(_wrong_unit(ratio))
 
@@ -289,7 +289,7 @@ def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
     if covariance[6, 6] > _SHIFT_LOST_S**2:
         reasons.append(
             f"the delay is not determined (sigma {1e3 * np.sqrt(covariance[6, 6]):.1f} ms): "
-            "the rotation rate hardly changed; turn to and fro"
+            "the rotation rate hardly changed; turn back and forth"
         )
     values, vectors = np.linalg.eigh(covariance[:3, :3])
     if values[2] > _ROTATION_LOST_RAD**2:

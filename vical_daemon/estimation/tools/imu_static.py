@@ -154,7 +154,7 @@ def calibrate_imu(
     rests = find_rests(gyro_rps, accel_mps2, rate_hz, min_rest_s)
     if len(rests) < POSITIONS_MIN:
         raise PoorMotionError(
-            f"only {len(rests)} rests of {min_rest_s:g} s found, {POSITIONS_MIN} needed: hold the imu still "
+            f"only {len(rests)} rests of {min_rest_s:g} s found, {POSITIONS_MIN} needed: hold the IMU still "
             "on each of its six faces and some edges in between"
         )
     accel = calibrate_accelerometer(rests, gravity_mps2)
@@ -182,7 +182,7 @@ def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) ->
     x, sigma, rms = _solve(residuals, start)
     if not np.all(np.isfinite(sigma)) or np.max(sigma[:6]) > 0.02:
         raise PoorMotionError(
-            "the positions are too much alike to tell the axes apart: put the imu on all six faces, "
+            "the positions are too similar to separate the axes: put the IMU on all six faces, "
             "each way up, and on some edges"
         )
     return SensorCalibration(_lower(x[:6]), _lower(sigma[:6]), x[6:], sigma[6:], rms)

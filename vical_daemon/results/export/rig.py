@@ -33,7 +33,7 @@ class RigCamera:
         readout_s: First to last row of a rolling shutter, s; 0: global shutter.
         readout_axis: What it reads one after the other, `rows` or `columns`; empty: rows, or not known.
         topic: ROS topic of the images.
-        rate_hz: Frames a second; None: not known.
+        rate_hz: Frames per second; None: not known.
         unobservable: Directions that the motion did not reveal: do not use their values.
         lens_sigma: Standard deviations of fx fy cx cy and the distortion; (): not known.
         calibration_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.

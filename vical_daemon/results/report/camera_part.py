@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 
 _DISTANCES = ((1.0, "1 m"), (float("inf"), "infinity"))
 _COVERED = 0.6  # share of the image's cells with corners below which the lens is extrapolated
-_COVERAGE_HINT = (
-    "Large parts of the image never saw the board: move it into the corners to pin the lens down."
-)
+_COVERAGE_HINT = "Large parts of the image have not seen the board: move it into the corners, for the lens."
 
 
 class CameraPart:
@@ -96,7 +94,7 @@ class CameraPart:
         R, p, cam = self.R, self.p, self.name
         drawn = self.gallery.add(f"{cam}-correlation", figures.correlation(covariance), "correlation")
         return page.section(
-            f"{cam}: where it sits and how late it is",
+            f"{cam}: mounting and time shift",
             page.side_by_side(page.table(values.HEAD, values.camera_rows(self.camera)), drawn),
             page.note(f"Pose of {cam} in the frame of {imu}, m: maps points of {cam} to {imu}."),
             page.copyable(values.matrix_text(R, p, f"T_{imu}_{cam}")),
@@ -128,8 +126,8 @@ class CameraPart:
         if not maps:
             return []
         text = (
-            "Where a point that is fixed in the frame of the IMU falls in the image, one sigma in the worst "
-            f"direction, from the covariance of mounting and lens: {'; '.join(words)}."
+            "Uncertainty of the pixel of a point that is fixed to the IMU, one sigma in the worst direction, "
+            f"from the covariance of mounting and lens: {'; '.join(words)}."
         )
         name = f"{self.name}-projection"
         drawn = self.gallery.add(name, coverage_figures.projection(maps, self.size), "projection uncertainty")
@@ -204,5 +202,5 @@ class CameraPart:
         found = self.images(self.name, stamps) if self.images is not None else {}
         begin_ns = min(frame.t_ns for frame in self.frames if frame.camera == self.name)
         shots = page.grid(worst.drawn(frame, self.size, begin_ns, found) for frame in chosen)
-        text = "Times since the first image. Green: used corners; red: refused ones."
-        return [page.section(f"{self.name}: the images that fit worst", page.note(text), shots)]
+        text = "Times since the first image. Green: used corners; red: rejected ones."
+        return [page.section(f"{self.name}: the images with the largest residuals", page.note(text), shots)]

@@ -101,7 +101,7 @@ def _camera(name: str, camera: Mapping[str, Any], gallery: Gallery) -> list[str]
     ]
     if "lens_px" in camera:
         px = f"{camera['lens_px']:.2f} ± {camera['lens_px_sigma']:.2f} px"
-        parts.append(page.note(f"The lenses alone project {px} apart, RMS over the image."))
+        parts.append(page.note(f"The lenses alone differ by {px}, RMS over the image."))
     sections = [page.section(f"{name}: the difference", *parts)]
     maps = [
         gallery.add(

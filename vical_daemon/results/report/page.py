@@ -48,13 +48,23 @@ def head(title: str, status: str, said: Verdict, facts: Sequence[str], kind: str
     """Return the head of the page: verdict, what to do, and a line of facts; `kind` chooses its colour."""
     kind = kind or (status if status.isalpha() else "unknown")
     known = "".join(f'<p class="known">{escape(line)}</p>' for line in said.known)
-    advice = "".join(f"<li>{escape(line)}</li>" for line in said.advice)
+    advice = "".join(f"<li>{_sentence(line)}</li>" for line in said.advice)
     return (
         f'<header><h1>{escape(title)}</h1><span class="pill {kind}">{escape(status)}</span></header>'
         f'<div class="card verdict {kind}"><p class="word">{escape(said.word)}</p>{known}'
         + (f"<ul>{advice}</ul>" if advice else "")
         + f'<p class="note">{escape(" · ".join(facts))}</p></div>'
     )
+
+
+def _sentence(text: str) -> str:
+    """Return text as HTML, with a full stop; what stands in backticks becomes code.
+
+    >>> _sentence("remove `fix`")
+    'remove <code>fix</code>.'
+    """
+    whole = text if text.endswith((".", "?")) else f"{text}."
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(whole))
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric_from: int = 1) -> str:
@@ -137,10 +147,10 @@ def scene(document: dict[str, Any]) -> str:
     return (
         f'<div class="scene"><script type="application/json">{data}</script>'
         '<canvas role="img" tabindex="0" aria-label="3-D view of IMU, camera and board; '
-        'arrow keys turn it, plus and minus bring it nearer"></canvas>'
+        'arrow keys rotate it, plus and minus zoom"></canvas>'
         f"<p>{rooms}{gains}</p>"
-        '<p class="note">Drag to turn, wheel or two fingers to come nearer. Red: where the camera may be; '
-        "at its axes: where their tips may be.</p></div>"
+        '<p class="note">Drag to rotate, scroll or pinch to zoom. Red, 1 sigma: position of the camera, '
+        "and of the tips of its axes.</p></div>"
     )
 
 

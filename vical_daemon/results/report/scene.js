@@ -1,6 +1,6 @@
 "use strict";
 // 3-D view on a canvas: imu and camera with axes and ellipsoids of one sigma to scale, board, path of the camera.
-// Drag to turn, wheel or two fingers to come nearer. Data: {rig: {p, R, p_cov, r_cov}, board: [[x, y, z], …],
+// Drag to rotate, scroll or pinch to zoom. Data: {rig: {p, R, p_cov, r_cov}, board: [[x, y, z], …],
 // path: [{p, R}, …]}; rig in the imu frame, board and path (camera poses) in the target frame; m and rad.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -41,8 +41,8 @@ def camera_rows(camera: dict[str, Any]) -> list[Row]:
     for i, axis in enumerate("xyz"):
         rows.append((f"lever arm {axis}", *value(1e3 * pose["p_m"][i], 1e3 * sigma[i]), "mm"))
     angles = zip(euler_deg(q), euler_sigma_deg(q, pose["covariance"]), strict=True)
-    for name, (angle, spread) in zip(("roll (X)", "pitch (Y)", "yaw (Z)"), angles, strict=True):
-        rows.append((f"rotation {name}", *value(angle, spread), "deg"))
+    for name, (angle, spread) in zip(("roll (x)", "pitch (y)", "yaw (z)"), angles, strict=True):
+        rows.append((name, *value(angle, spread), "deg"))
     rows.append(("quaternion w x y z", " ".join(f"{v:+.6f}" for v in q), "", ""))
     about = " ".join(f"{s:.4f}" for s in np.degrees(sigma[3:]))
     rows.append(("sigma about cam x y z", about, "", "deg"))
@@ -105,12 +105,12 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
         lines.append(f"The status is {status!r}: {result.get('reason') or 'the filter had not converged'}.")
     for name, camera in (result.get("cameras") or {}).items():
         withheld = camera.get("unobservable") or []
-        lines += [f"{name}: not revealed by the motion, do not use: {direction}." for direction in withheld]
+        lines += [f"{name}: not determined by the motion, do not use: {direction}." for direction in withheld]
     free = result.get("mode") == "target_free"
     nis = float(result.get("nis_per_dof") or 0.0)
     if nis > 1.5 and free:
         lines.append(
-            f"Stretches of the data differ by {nis:.2f} times the variance expected. The sigmas "
+            f"Stretches of the data differ by {nis:.2f} times the expected variance. The sigmas "
             "include that. Check the lens model, the shutter and the stamps."
         )
     elif nis > 1.5:
@@ -122,7 +122,7 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
     rejected = float(result.get("rejected_fraction") or 0.0)
     if rejected > 0.05:
         why = "blur, or things that move?" if free else "blur, wrong ids or a wrong board?"
-        lines.append(f"{100 * rejected:.1f} % of the measurements were refused: {why}")
+        lines.append(f"{100 * rejected:.1f} % of the measurements were rejected: {why}")
     lines += advice_of(result.get("events") or [])
     if result.get("guidance"):
         lines.append(f"What would help: {result['guidance']}")
@@ -173,9 +173,9 @@ def held_out_text(checks: Sequence[dict[str, float]], noise: dict[str, float] | 
     ratio = [float(check["ratio"]) for check in checks]
     rms, median = math.sqrt(sum(ratio) / len(ratio)), math.sqrt(float(np.median(ratio)))
     text = (
-        f"{len(ratio)} times the IMU alone predicted an image 0.3 s ahead that was not used yet. The "
-        f"errors are {rms:.2f} times (RMS) and {median:.2f} times (median) those that the stated noise of "
-        "IMU and corners predicts."
+        f"The IMU alone predicted {len(ratio)} images 0.3 s ahead, before they were used. The errors are "
+        f"{rms:.2f} times (RMS) and {median:.2f} times (median) those expected from the stated noise of IMU "
+        "and corners."
     )
     if noise:
         text += (

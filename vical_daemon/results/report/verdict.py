@@ -25,7 +25,7 @@ from vical_daemon.results.report.values import warnings_of
 _WORDS = {
     Status.CONVERGED: "Good.",
     Status.CONVERGING: "Not finished.",
-    Status.DEGENERATE: "Incomplete: the motion did not show everything.",
+    Status.DEGENERATE: "Incomplete: the motion did not determine every direction.",
     Status.INCONSISTENT: "Do not use: the data contradict each other.",
 }
 _NOT_YET = "Do not use: there is no result yet."
@@ -80,7 +80,7 @@ def _known(camera: Mapping[str, Any]) -> str:
     words = [f"{name} {_with(sigma, unit)}" for name, sigma, unit in parts if sigma > 0]
     if not words:
         return "Nothing was estimated: mounting and time shift were fixed."
-    return f"Known to 1 sigma, in the worst direction: {', '.join(words)}."
+    return f"1 sigma in the worst direction: {', '.join(words)}."
 
 
 def main_cause(camera: Mapping[str, Any], *, lens_held: bool = False) -> str:
@@ -97,13 +97,13 @@ def main_cause(camera: Mapping[str, Any], *, lens_held: bool = False) -> str:
         show = "bring the board to the edges of the image, tilted, near and far"
         return (
             f"{100 * lens_share(camera):.0f} % of the variance of the lever arm comes from the lens: "
-            f"{'leave it free' if lens_held else show}."
+            f"{'let vical estimate it' if lens_held else show}."
         )
     R = so3.matrix_from_quat(np.array(camera["T_imu_cam"]["q_wxyz"], dtype=np.float64))
     _, vectors = np.linalg.eigh(p)
     return (
-        f"The lever arm is known least along {axis_name(R.T @ vectors[:, 2])}: more of the same data, with "
-        "faster turns about the other two axes, improves it."
+        f"The lever arm is least certain along {axis_name(R.T @ vectors[:, 2])}: more data, with faster "
+        "rotation about the other two axes, improves it."
     )
 
 
@@ -157,7 +157,7 @@ def limits(result: Mapping[str, Any], camera: Mapping[str, Any]) -> list[tuple[s
     nis = result.get("nis_per_dof")
     if nis:
         rows.append(
-            ("model", f"NIS {float(nis):.2f}", "1 where errors are as large as their sigmas, below: cautious")
+            ("model", f"NIS {float(nis):.2f}", "1: errors match the sigmas; below 1: the sigmas are cautious")
         )
     return rows
 
@@ -171,9 +171,7 @@ def _stamps(camera: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     data = math.sqrt(float(joint[k, k]))
     text = f"time shift {_two(1e3 * stated)} ms"
     if data < _DATA_ALONE * stated:
-        return [
-            ("stamps of the IMU", text, f"{_two(1e3 * data)} ms if the IMU's driver knew its stamps exactly")
-        ]
+        return [("stamps of the IMU", text, f"{_two(1e3 * data)} ms with exact IMU stamps")]
     return [("stamps", text, "all of it from corners and motion")]
 
 
@@ -186,7 +184,7 @@ def _shares(camera: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     rows = []
     for cause, known in (("lens", lens), ("time shift", ("timeshift",))):
         if not any(name in order for name in known):
-            rows.append((cause, "held as known", "adds nothing to the sigmas"))
+            rows.append((cause, "fixed", "adds nothing to the sigmas"))
             continue
         arm = [1e3 * sigma_if_known(order, joint, POSITION, k) for k in ((), known)]
         turn = [math.degrees(sigma_if_known(order, joint, ROTATION, k)) for k in ((), known)]

@@ -69,7 +69,7 @@ def write_report(
         frames: Residuals of every frame; None: the report says that they were not kept.
         image_sizes: width, height by camera; None: `resolution` in the result, else from the points.
         target_m: Points of the board by id, target frame, m, shape (n, 3); None: not known, or target-free.
-        images: Where the images that fit worst come from; None: only their corners are drawn.
+        images: Where the images with the largest residuals come from; None: only their corners are drawn.
         provenance: What made the result; None: collected now, without inputs.
         png_folder: Figures also as PNG files there (made where it does not exist).
 
@@ -95,7 +95,7 @@ def write_report(
         body += _imu_section(result, gallery)
         rows = values.event_rows(result.get("events") or [])
         if rows:
-            body.append(page.section("What was announced, when", page.table(("time", "event"), rows, 9)))
+            body.append(page.section("Events", page.table(("time", "event"), rows, 9)))
         body.append(provenance_section(provenance or collect()))
         write_output(path, page.document(_TITLE, body))
     except OSError as error:
@@ -107,11 +107,11 @@ def _head(result: Mapping[str, Any]) -> str:
     facts += [f"{int(result[k])} {label}" for k, label in _COUNTS if result.get(k)]
     if result.get("cpu_s"):
         facts.append(f"{float(result['cpu_s']):.1f} s of CPU")
-    facts.append(f"{100 * float(result.get('rejected_fraction') or 0):.2f} % of the points refused")
+    facts.append(f"{100 * float(result.get('rejected_fraction') or 0):.2f} % of the points rejected")
     return page.head(_TITLE, str(result.get("status", "unknown")), verdict(result), facts)
 
 
-_COUNTS = (("frames", "frames"), ("imu_samples", "inertial samples"))
+_COUNTS = (("frames", "frames"), ("imu_samples", "IMU samples"))
 
 
 def _imu_section(result: Mapping[str, Any], gallery: Gallery) -> list[str]:

@@ -107,7 +107,7 @@ function drawCharts() {
   fillValues("shift", [["", "one", value("shift_ms"), value("sshift_ms")]]);
   charts.nis.set([{ t, v: column("nis"), s: null, colour: "--one" }], page.span);
   const latest = page.latest[page.camera];
-  fillValues("nis", latest ? [["NIS", "one", round(latest.nis, 3), 0], ["refused", "one", round(100 * (latest.rejected || 0), 3), 0]] : []);
+  fillValues("nis", latest ? [["NIS", "one", round(latest.nis, 3), 0], ["rejected %", "one", round(100 * (latest.rejected || 0), 3), 0]] : []);
   if (latest) $("nis").lastChild.append(element("span", "s", " %"));
 
   const G = ["gx_mrad", "gy_mrad", "gz_mrad"], SG = ["sgx_mrad", "sgy_mrad", "sgz_mrad"];
@@ -149,7 +149,7 @@ function drawWords() {
   setText("spoken", fault ? `${fault.headline} ${fault.message}` : [status, latest ? latest.guidance : ""].filter(Boolean).join(": "));
   setText("reason", fault ? `Calibration: ${headline}` : latest ? latest.reason : "");
   $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
-  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 1 sigma` : "");
+  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} IMU samples · ± is 1 sigma` : "");
   const withheld = latest ? latest.withheld : [];
   $("withheld").replaceChildren(...withheld.map((line) => element("li", "", line)));
   const news = latest ? latest.events.slice().reverse() : [];
@@ -231,7 +231,7 @@ function keepSights(sights, full) { // a full message has the path, later ones t
 
 function drawSight() {
   const sight = page.sights[page.camera], latest = page.latest[page.camera];
-  // No advice with a fault or old values, and none that contradicts "nothing is missing".
+  // No advice with a fault or old values, and none that contradicts "no more motion needed".
   const quiet = faultOf(latest) || !latest || latest.stale || (["converged", "holds", "changed"].includes(latest.status) && !latest.guidance);
   camera.coverage = sight ? sight.coverage : null;
   camera.setWanted(sight && sight.wanted && !quiet ? sight.wanted : null);

@@ -144,7 +144,7 @@ class CameraScreen {
     const found = new Map(detected.map(([id, u, v]) => [id, [u, v]]));
     const off = predicted.filter(([id]) => found.has(id))
       .map(([id, u, v]) => Math.hypot(u - found.get(id)[0], v - found.get(id)[1])).sort((a, b) => a - b);
-    return off.length ? `${detected.length} corners, half of them within ${off[off.length >> 1].toFixed(2)} px` : "";
+    return off.length ? `${detected.length} corners, median error ${off[off.length >> 1].toFixed(2)} px` : "";
   }
 }
 

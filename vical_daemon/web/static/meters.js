@@ -23,7 +23,7 @@ const meters = {
   one(m) {
     const full = m.share >= 1;
     const bar = element("span", full ? "meter full" : "meter");
-    bar.title = `${m.kind} ${m.name}: ${Math.round(100 * m.share)} % of the information that is needed; sigma ${m.sigma} ${m.unit}`;
+    bar.title = `${m.kind} ${m.name}: ${Math.round(100 * m.share)} % of the required information; sigma ${m.sigma} ${m.unit}`;
     const fill = element("i");
     fill.style.width = `${Math.max(100 * m.share, 2)}%`;
     bar.append(element("b", `k ${"xyz".includes(m.name) ? m.name : "one"}`, m.kind === "time" ? "t" : m.name), fill,
@@ -38,7 +38,7 @@ const meters = {
     if (sight && sight.rate_hz) facts.push(`${sight.rate_hz} images/s`);
     if (sight && sight.board_share !== null) facts.push(`${Math.round(100 * sight.board_share)} % of the board`);
     if (sight && sight.blur) facts.push(`blur ${sight.blur.px} px`);
-    if (light) facts.push(`light ${Math.round(100 * light.level)} %`);
+    if (light) facts.push(`brightness ${Math.round(100 * light.level)} %`);
     if (sight && sight.coverage) facts.push(`${Math.round(100 * sight.coverage.share)} % of the image covered`);
     setText("imagefacts", facts.join(" · "));
   },

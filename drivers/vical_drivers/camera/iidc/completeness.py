@@ -52,7 +52,7 @@ def check_completeness(
         info: What the camera wrote at the beginning of the image.
         frame_info: Which embedded items are on (see `embedded.parse_embedded`).
         age_ns: From its first packet on the bus until it was found complete, ns.
-        rate_hz: Frames a second; 0.0: unknown.
+        rate_hz: Frames per second; 0.0: unknown.
     """
     if packet_bytes > 0 and _holds_next_header(buffer, packet_bytes, info, frame_info):
         return Completeness.SHIFTED

@@ -69,7 +69,7 @@ def test_a_camera_clock_that_is_set_is_followed_by_the_order_of_arrival(step_s):
     assert sum(x is None for x in taken) == 4
     np.testing.assert_allclose([x for x in taken if x is not None], np.delete(t, np.r_[100:104]), atol=1e-9)
     assert [event_text(e) for e in intake.news()] == [
-        f"cam0: its stamps stepped by about {step_s:+.1f} s against those of the IMU"
+        f"cam0: its stamps stepped by about {step_s:+.1f} s relative to those of the IMU"
     ]
     assert intake.offset_s("cam0") == pytest.approx(-step_s)
 

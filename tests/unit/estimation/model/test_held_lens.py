@@ -213,7 +213,7 @@ def test_a_wrong_fixed_lens_is_announced_and_nothing_beyond_its_sigmas_is_said(r
     assert camera.intrinsics == list(wrong.intrinsics)
     assert camera.intrinsics_sigma[2] == pytest.approx(5.0, rel=0.2)
     assert estimate.status is Status.CONVERGING
-    assert "the fixed lens of cam0 is not this camera's: leave it free" in estimate.reason
+    assert "the fixed lens of cam0 is not this camera's: estimate it" in estimate.reason
 
 
 def test_a_fixed_lens_that_is_zoomed_is_no_bump():

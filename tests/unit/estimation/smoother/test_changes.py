@@ -1,4 +1,4 @@
-"""Without a target, after a change of the rig: what changed is found and announced, and all else is kept."""
+"""Without a target, after a change of the rig: what changed is found and announced, and the rest is kept."""
 
 from dataclasses import replace
 
