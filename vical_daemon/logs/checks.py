@@ -94,7 +94,7 @@ def _check_one_device(name: str, samples: ImuArrays) -> None:
     jumps = (ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))
     if jumps.mean() > _JUMPS:
         raise RecordingError(
-            f"{name}: its readings jump to and fro between two sets, as if two IMUs took turns in one topic "
+            f"{name}: its readings jump back and forth between two sets, as if two IMUs shared one topic "
             "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
         )
 

@@ -290,7 +290,7 @@ def keys_of(job: Job, part: Job) -> dict[str, str]:
 def suspects(job: Job) -> str:
     """Name what to check when the motion is not to blame: wrong input looks like poor motion."""
     spans = ", ".join(f"{name} {stream.duration_s:.1f} s" for name, stream in job.cameras.items())
-    things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
+    things = ["the lens in --initial", f"the stamps (IMU {job.imu.duration_s:.1f} s, {spans})"]
     if job.config.target:
         things.insert(0, f"the sizes in {job.config.target}")
     return (

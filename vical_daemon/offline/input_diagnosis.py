@@ -120,7 +120,7 @@ def _wrong_held_value(job: Job, prior: CameraPrior, found: TdIcpResult) -> str:
             angle = np.rad2deg(turn.magnitude())
             return (
                 f"the mounting held by --fix extrinsics is {angle:.0f} deg from what rotations show{hint}; "
-                "correct it or leave it free"
+                "correct it, or let vical estimate it"
             )
     shift_s, sigma_s = found.timeshift_cam_imu_s, found.timeshift_sigma_s
     given_s = prior.timeshift_cam_imu_s
@@ -132,6 +132,6 @@ def _wrong_held_value(job: Job, prior: CameraPrior, found: TdIcpResult) -> str:
         other = " (is its sign reversed?)" if abs(given_s + shift_s) < _CERTAIN * sigma_s + _SHIFTED_S else ""
         return (
             f"the time shift held by --fix timeshift is {1e3 * given_s:.1f} ms, rotations show "
-            f"{1e3 * shift_s:.1f} ± {1e3 * sigma_s:.1f} ms{other}; correct it or leave it free"
+            f"{1e3 * shift_s:.1f} ± {1e3 * sigma_s:.1f} ms{other}; correct it, or let vical estimate it"
         )
     return ""

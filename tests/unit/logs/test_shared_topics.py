@@ -81,7 +81,7 @@ def test_two_imus_on_one_topic_are_told_apart_by_their_frame_ids(tmp_path, a_mot
 def test_two_imus_that_cannot_be_told_apart_are_named(tmp_path, a_motion, every):
     motion = a_motion()
     other = imu(motion, "imu", later_ns=2_000_000, turned=TURNED)[::every]
-    with pytest.raises(RecordingError, match=r"imu0: .* as if two IMUs took turns"):
+    with pytest.raises(RecordingError, match=r"imu0: .* as if two IMUs shared one topic"):
         open_recording(write(tmp_path / "a.mcap", imu(motion, "imu") + other + raw(motion)))
 
 

@@ -77,7 +77,7 @@ def choose_gyro(
     if not imus:
         raise InputError(f"{recording.path} holds no IMU data")
     if name is None and len(imus) > 1:
-        raise OptionError(f"{recording.path} holds the imus {', '.join(imus)}; choose one with --imu")
+        raise OptionError(f"{recording.path} has several IMUs: {', '.join(imus)}; choose one with --imu")
     chosen = meant(imus, name) if name else next(iter(imus))
     if chosen not in imus:
         raise OptionError(f"{recording.path} holds no imu {chosen!r}, only {', '.join(imus)}")
