@@ -22,9 +22,10 @@ BoolArray = npt.NDArray[np.bool_]
 ROWS, COLUMNS = "rows", "columns"
 """What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
 
-IMAGE_GAP_S = 0.5
+IMAGE_GAP_S = 0.6
 """Between images further apart, s, is a gap: it is reported, and nothing is followed across it. A track may
-belong to another point, and the motion may be better known from the next image."""
+belong to another point, and the motion may be better known from the next image. A camera of 2 Hz has none,
+even if its stamps jitter."""
 LEAST_POINTS = 4
 """An image with fewer points of the target is not used: a homography needs four."""
 

@@ -304,6 +304,15 @@ def test_where_everything_is_far_away_there_is_no_answer_and_it_says_why():
     assert any("everything is far away, or features are lost before" in reason for reason in reasons)
 
 
+def test_two_images_a_second_whose_stamps_jitter_are_no_gaps():
+    """They ended as `collecting the first seconds`: every second interval was longer than half a second."""
+    rig = reference_rig(4, timeshift_cam_imu_s=-0.03)
+    run = simulate_tracks(4, 24.0, rig=rig, camera_rate_hz=2.0, stamp_jitter_s=2e-4)
+    record = feed(run, subject_for(run))
+    assert record.snapshots[-1].status == "converged" and record.started_s() <= 12.0
+    assert all(nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7) for shot in record.snapshots)
+
+
 def test_a_scene_with_too_few_features_is_told():
     """A lens of 12 degrees sees a few of them: 25 s of `collecting the first seconds`."""
     run = simulated(seconds=8.0)

@@ -55,7 +55,7 @@ _NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where st
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # of images in an attempt at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = 2.0 * ROTATION_SIGMA_RAD  # of the mounting by rotations: a window converges from there
 _SHIFT_SIGMA_S = 4e-3  # of the time shift: likewise, 0.2 deg at 60 deg/s
-_MOST_IMAGES = 120  # of a start: its cost grows with the cube
+_LEAST_IMAGES, _MOST_IMAGES = 20, 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 
 
@@ -97,9 +97,7 @@ class TargetFreeInitializer:
         if not (last or self.attempts.due(end_s)):
             return None
         shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
-        usable = _last_stretch(
-            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), LONG_S
-        )
+        usable = _last_stretch(frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0))
         if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
             self.motion_missing = False
             return (
@@ -167,7 +165,7 @@ class TargetFreeInitializer:
         """Speed, scale, lever arm and points; after turns about one axis the mounting about it, too."""
         camera = found.camera
         frames = [x for x in frames if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
-        if len(frames) < 20:
+        if len(frames) < _LEAST_IMAGES:
             return "inertial data do not cover the images: are both stamped by the same clock?"
         noise, gravity = at_least_measured(self.options.imu_noise, buffer.rows), self.options.gravity_mps2
         held = self.held if found.about is None else found.about
@@ -315,13 +313,18 @@ def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray 
     return axis if worst < _ROTATION_SIGMA_RAD else None
 
 
-def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:
-    """The last images without a hole between them; of very many every second or third."""
+def _last_stretch(frames: Frames, end_s: float, begin_s: float) -> Frames:
+    """The last images without a hole between them; of very many every second or third.
+
+    So many as a start needs may take a slow camera longer than a start usually looks back.
+    """
     out: Frames = []
     for t, frame in reversed(frames):
         if t > end_s or len(frame.ids) < MIN_FEATURES:
             continue
-        if t < begin_s or (out and (out[-1][0] - t > IMAGE_GAP_S or out[0][0] - t > span_s)):
+        if t < begin_s or (out and out[-1][0] - t > IMAGE_GAP_S):
+            break
+        if len(out) > _LEAST_IMAGES and out[0][0] - t > LONG_S:
             break
         out.append((t, frame))
     every = max(1, math.ceil(len(out) / _MOST_IMAGES))
