@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-# As `vical` itself does, before numpy is imported: a pool of BLAS threads doubles CPU times of small matrices.
+# As `vical` does, before numpy is imported: a pool of BLAS threads doubles the CPU time of small matrices.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
