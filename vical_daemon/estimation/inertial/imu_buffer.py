@@ -40,6 +40,7 @@ class ImuSegment(NamedTuple):
         accel_slope: m/s^3, shape (n + 1, 3).
         clipping_sigma: One sigma of what clipped readings miss, common to the segment, rad/s and m/s^2, shape
             (n + 1, 6); None: none is clipped.
+        trend: See `ImuBuffer.trend`, at the end; None: too few readings.
     """
 
     t_s: FloatArray
@@ -49,6 +50,7 @@ class ImuSegment(NamedTuple):
     gyro_slope: FloatArray | None = None
     accel_slope: FloatArray | None = None
     clipping_sigma: FloatArray | None = None
+    trend: FloatArray | None = None
 
 
 class ImuBuffer:
@@ -184,7 +186,21 @@ class ImuBuffer:
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
         """Return the readings between two instants with interpolated ends; None where not covered."""
         found = self.intervals(np.array([from_s, to_s]))
-        return None if found is None else found[0]
+        return None if found is None else found[0]._replace(trend=self.trend(to_s))
+
+    def trend(self, t_s: float) -> FloatArray | None:
+        """First and second derivative of the readings at an instant, by s and by s^2, shape (2, 6).
+
+        By the parabola through two readings on either side (least squares); None: there are less than three.
+        """
+        rows = self.rows
+        after = int(rows[:, 0].searchsorted(t_s))
+        near = rows[max(after - 2, 0) : after + 2]
+        if len(near) < 3:
+            return None
+        t = near[:, 0] - t_s
+        powers = np.array([np.ones_like(t), t, 0.5 * t * t])
+        return np.asarray(np.linalg.solve(powers @ powers.T, powers @ near[:, 1:])[1:])
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.

@@ -35,7 +35,7 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.model.imu_scale import APART, numbers_of
 from vical_daemon.estimation.model.inertial_links import DONE, RELINK_S, PreintegratedLinks, make_links
-from vical_daemon.estimation.model.rates import SLOPE_S, Rates
+from vical_daemon.estimation.model.rates import Rates, rates_at
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import BIASES, GRAVITY, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
@@ -148,7 +148,7 @@ class BoardWindow:
         self.noise: list[float] = []
         self.shared: dict[str, FloatArray] = {}
         self._derivatives = Derivatives()  # of the filters about the window, once it is solved
-        self._measured = (np.zeros((0, 3)),) * 3  # rate, specific force, derivative of the rate
+        self._measured: list[tuple[FloatArray, FloatArray, FloatArray | None]] = []  # by node, see `rates_at`
 
     @classmethod
     def begin(
@@ -252,15 +252,12 @@ class BoardWindow:
         assert found is not None  # links have been made over the same
         segment, begin = found
         at = np.append(begin, len(segment.t_s) - 1)
-        self._measured = segment.gyro[at], segment.accel[at], self._buffer.around(t_s, SLOPE_S)[1][:, :3]
+        trends = [self._buffer.trend(t) for t in t_s.tolist()]
+        self._measured = list(zip(segment.gyro[at], segment.accel[at], trends, strict=True))
 
     def _find_rates(self) -> None:
-        s = self.state
-        omega = (self._measured[0] - s.gyro_bias) @ s.gyro_matrix.T
-        force = (self._measured[1] - s.accel_bias) @ s.accel_matrix.T
-        alpha = self._measured[2] @ s.gyro_matrix.T
-        for node, *rates in zip(self.nodes, omega, force, alpha, strict=True):
-            node.rates = Rates(rates[0], node.at.R @ rates[1] + s.gravity, rates[2])
+        for node, measured in zip(self.nodes, self._measured, strict=True):
+            node.rates = rates_at(self.state, node.at.R, *measured, node.rates)
 
     def _stale(self) -> bool:
         """Whether time shifts have left the instants for which links hold."""

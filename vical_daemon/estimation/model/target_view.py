@@ -64,12 +64,17 @@ def _rolling(
     readout_s: FloatArray,
     rows: FloatArray,
 ) -> FloatArray:
-    """Displacement in the imu frame of points seen `rows * readout` after the middle row, to second order."""
+    """Displacement in the imu frame of points seen `rows * readout` after the middle row, to third order.
+
+    A point X of the world lies at x = R' (X - p), so that x' = -omega x x - u with u = R' v, and likewise for
+    the derivatives of both.
+    """
     e = (readout_s[:, None] * rows)[..., None]
-    v_imu = np.matmul(motion.v[:, None, :], R)
-    a_imu = np.matmul(rates.accel, R)[:, None, :]
-    w = rates.omega
-    x1 = -so3.cross(w, x_imu) - v_imu
-    x2 = -so3.cross(rates.alpha, x_imu) - so3.cross(w, x1) + so3.cross(w, v_imu) - a_imu
-    out: FloatArray = e * x1 + (0.5 * e * e) * x2
-    return out
+    w, alpha = rates.omega, rates.alpha
+    u = np.matmul(motion.v[:, None, :], R)
+    u1 = np.matmul(rates.accel, R)[:, None, :] - so3.cross(w, u)
+    u2 = rates.jolt - so3.cross(alpha, u) - so3.cross(w, u1)
+    x1 = -so3.cross(w, x_imu) - u
+    x2 = -so3.cross(alpha, x_imu) - so3.cross(w, x1) - u1
+    x3 = -so3.cross(rates.jerk, x_imu) - 2.0 * so3.cross(alpha, x1) - so3.cross(w, x2) - u2
+    return np.asarray(e * (x1 + (0.5 * e) * (x2 + (e / 3.0) * x3)))

@@ -145,6 +145,24 @@ def test_buffer_refuses_what_is_not_newer_and_stays_bounded_when_trimmed():
     assert buffer.segment(buffer.newest_s - 0.5, buffer.newest_s) is not None
 
 
+def test_the_trend_is_that_at_the_instant_itself():
+    """By the readings before it alone, it was that of 10 ms earlier, and time shifts were 4 sigma off."""
+    w, buffer, t_s = 2 * np.pi * 2.0, ImuBuffer(0), 0.5123
+    for k in range(100):
+        t = 0.01 * k
+        buffer.append(t, np.array([np.sin(w * t), np.cos(w * t), 0.2]), np.array([t, 3.0 * t, 9.8]))
+    first, second = buffer.trend(t_s)
+    sine, cosine = np.sin(w * t_s), np.cos(w * t_s)
+    true = np.array([w * cosine, -w * sine, 0.0])
+    np.testing.assert_allclose(first[:3], true, atol=0.03 * w)
+    np.testing.assert_allclose(first[3:], [1.0, 3.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        second[:2], -w * w * np.array([np.sin(w * t_s), np.cos(w * t_s)]), atol=0.1 * w * w
+    )
+    assert buffer.segment(0.4, t_s).trend == pytest.approx(np.array([first, second]))
+    assert ImuBuffer(0).trend(0.0) is None
+
+
 def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
     w, half_s = 2 * np.pi * 8.0, 0.015  # a hand's tremor
     buffer = ImuBuffer(0)

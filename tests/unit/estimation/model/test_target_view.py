@@ -75,6 +75,33 @@ def test_rolling_shutter_is_a_global_one_at_each_rows_own_time():
     assert np.abs(expected - still).max() > 3.0
 
 
+def test_rows_of_a_slow_readout_follow_a_shaken_camera():
+    """Against a motion that is integrated in small steps."""
+    m, readout, steps = motion(), 0.05, 2000
+    omega, alpha, jerk = (
+        np.array([2.0, -1.5, 1.0]),
+        np.array([20.0, 30.0, -25.0]),
+        np.array([-300.0, 200.0, 400.0]),
+    )
+    accel, change = np.array([8.0, -5.0, 6.0]), np.array([90.0, 120.0, -80.0])
+    jolt = m.R[0].T @ change - np.cross(omega, m.R[0].T @ accel)
+    rates, rows = Rates(omega, accel, alpha, jerk, jolt), np.linspace(-0.5, 0.5, len(X))
+    seen = view(X, m, camera(readout=readout), rates, 0.0, "radtan", rows)[0]
+    second = view(X, m, camera(readout=readout), Rates(omega, accel, alpha), 0.0, "radtan", rows)[0]
+    off = []
+    for k, row in enumerate(rows):
+        late = readout * row
+        R, middles = Rotation.from_matrix(m.R[0]), (np.arange(steps) + 0.5) * late / steps
+        for t in middles:
+            R = R * Rotation.from_rotvec((omega + alpha * t + 0.5 * jerk * t * t) * late / steps)
+        p = m.p[0] + m.v[0] * late + 0.5 * accel * late**2 + change * late**3 / 6.0
+        there = Motion(R.as_matrix()[None], p[None], m.v)
+        true = view(X[k : k + 1], there, camera(), rates, 0.0, "radtan")[0, 0]
+        off.append([np.abs(seen[k] - true).max(), np.abs(second[k] - true).max()])
+    third, to_second = np.max(off, axis=0)
+    assert third < 0.06 and to_second > 0.4
+
+
 def test_batch_equals_loop():
     m = motion()
     two = Motion(np.repeat(m.R, 2, 0), m.p + np.array([[0, 0, 0], [0.01, 0.02, 0.03]]), np.repeat(m.v, 2, 0))
