@@ -24,6 +24,9 @@ GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap a
 _LEAST_HALF_S = 1e-3  # of an average at either end of the data: one interval of the fastest IMUs
 BLOCK_S = 5.005e-3
 """A block of `BlockMeans` may be so long: readings of up to 333 Hz stay as they are; stamps have jitter."""
+_DISTINCT = 1e-3
+"""Stamps nearer to each other than this share of the others' distance are one: the parabola through even ones
+has a ratio of singular values of 0.04 or more."""
 _ROOM = 4096  # readings for which there is room at first
 _USUAL = 201  # samples whose median interval is the usual one
 
@@ -199,8 +202,11 @@ class ImuBuffer:
         if len(near) < 3:
             return None
         t = near[:, 0] - t_s
-        powers = np.array([np.ones_like(t), t, 0.5 * t * t])
-        return np.asarray(np.linalg.solve(powers @ powers.T, powers @ near[:, 1:])[1:])
+        span_s = np.abs(t).max()
+        u = t / span_s
+        powers = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
+        found = np.linalg.lstsq(powers, near[:, 1:], rcond=_DISTINCT)[0]
+        return np.asarray(found[1:] / np.array([[span_s], [span_s**2]]))
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -347,7 +353,8 @@ def _at_instants(rows: FloatArray, spread_s2: float) -> FloatArray:
     step = np.diff(rows, axis=0)
     out = rows.copy()
     bend = np.diff(step[:, 1:] / step[:, :1], axis=0) / (step[1:, :1] + step[:-1, :1])  # half of it
-    out[1:-1, 1:] -= spread_s2 * bend
+    apart = np.minimum(step[1:, 0], step[:-1, 0]) > math.sqrt(spread_s2)  # else their noise is no bend
+    out[1:-1, 1:] -= spread_s2 * bend * apart[:, None]
     return out
 
 

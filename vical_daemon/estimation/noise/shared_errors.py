@@ -43,9 +43,9 @@ class SharedErrors:
         jitter_found_s: The jitter where there surely is one, s; else 0.
         wander_px: The shift where it is large and that of neighbours alike (image stabilisation, a loose
             lens, a board that moves); else 0.
-        wander_s: Likewise of the delays of the images (an exposure that adapts to the light), also while it
-            is not told yet whether they are alike.
-        told: Images are enough to tell whether those of neighbours are alike.
+        wander_s: Likewise of the delays of the images (an exposure that adapts to the light), also while
+            their correlation is not known yet.
+        correlation_known: There are enough images to know the correlation of neighbours.
         images: Images taken in.
         until_s: Stamp (s) up to which images are known from the start, and are not to count again; -inf once
             they have passed.
@@ -56,7 +56,7 @@ class SharedErrors:
     jitter_found_s: float = 0.0
     wander_px: float = 0.0
     wander_s: float = 0.0
-    told: bool = False
+    correlation_known: bool = False
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
@@ -119,8 +119,12 @@ class SharedErrors:
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
         surely, alike = 1.0 - known.absent[0] > SURE, self._alike(0, self.jitter_s)
         self.jitter_found_s = self.jitter_s if surely and alike < PERSISTENT else 0.0
-        self.told = math.isfinite(alike)
-        varies = surely and self.jitter_s > _WANDERS_S and (not self.told or PERSISTENT < alike < _MOST_ALIKE)
+        self.correlation_known = math.isfinite(alike)
+        varies = (
+            surely
+            and self.jitter_s > _WANDERS_S
+            and (not self.correlation_known or PERSISTENT < alike < _MOST_ALIKE)
+        )
         self.wander_s = self.jitter_s if varies else 0.0
         wanders = self.shift_px > _WANDERS_PX and PERSISTENT < self._alike(1, self.shift_px) < math.inf
         self.wander_px = self.shift_px if wanders else 0.0

@@ -153,7 +153,7 @@ class StatusEvaluator(Evaluator):
         if shared.wander_px:
             event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
             self.announce(event, once=f"wander {report.camera}")
-        if shared.wander_s and shared.told:
+        if shared.wander_s and shared.correlation_known:
             event = Event(EventKind.TIMESHIFT_VARIES, report.camera, shared.wander_s)
             self.announce(event, once=f"varies {report.camera}")
 
@@ -239,7 +239,7 @@ class StatusEvaluator(Evaluator):
             return IMAGES_WANDER
         varying = [x for x in f.shared.values() if x.wander_s]
         if varying:
-            return SHIFT_VARIES if any(x.told for x in varying) else CONFIRMING
+            return SHIFT_VARIES if any(x.correlation_known for x in varying) else CONFIRMING
         return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=self.believed), "")
 
     def weighed(self, f: CalibrationFilter, shares: model_mixture.Weights | None = None) -> CalibrationFilter:

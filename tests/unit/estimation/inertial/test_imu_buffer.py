@@ -163,6 +163,25 @@ def test_the_trend_is_that_at_the_instant_itself():
     assert ImuBuffer(0).trend(0.0) is None
 
 
+@pytest.mark.parametrize("stamps", [[0.0, 1e-9, 0.01], [0.0, 0.01, 0.010001], [0.0, 1e-9, 0.01, 0.010001]])
+def test_two_readings_that_nearly_coincide_are_one_for_the_trend(stamps):
+    """By the normal equations a noise of 0.01 became 1e7 rad/s^2."""
+    rng, buffer = np.random.default_rng(2), ImuBuffer(0)
+    for t in stamps:
+        buffer.append(t, 0.01 * rng.standard_normal(3), 0.01 * rng.standard_normal(3))
+    first, second = np.abs(buffer.trend(0.01)).max(axis=1)
+    assert first < 10.0 and second < 1000.0
+
+
+def test_means_that_nearly_coincide_are_left_as_they_are():
+    rng, buffer = np.random.default_rng(3), ImuBuffer(0)
+    buffer.spread_s2 = 2e-6
+    for k in range(20):
+        for t in (0.01 * k, 0.01 * k + 1e-7):
+            buffer.append(t, 0.01 * rng.standard_normal(3), np.zeros(3))
+    assert np.abs(buffer.segment(0.04, 0.15).gyro).max() < 0.05
+
+
 def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
     w, half_s = 2 * np.pi * 8.0, 0.015  # a hand's tremor
     buffer = ImuBuffer(0)
