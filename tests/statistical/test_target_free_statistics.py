@@ -3,12 +3,16 @@
 Limits are chi-square quantiles at 99.9 %, as in `test_calibration_statistics.py`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from vical_mocks.cramer_rao.bound import bounds
 from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.curves import Pause
 from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, nees
+from vical_mocks.random_rigs import draw
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
@@ -102,3 +106,25 @@ def test_optional_blocks_are_as_good_as_they_say():
     for squares, dof in zip(found.T, (7, 1, 15), strict=True):
         low, high = chi2.ppf([0.0005, 0.9995], dof * TRIALS)
         assert low < squares.sum() < high, dof
+
+
+@pytest.mark.parametrize("seed", [921, 933, 950, 966])
+def test_stop_and_go_motion_starts(seed):
+    """At rest no distance shows: steps cut off at infinity lowered nothing, and no window settled."""
+
+    def paused(rig):
+        pauses = [Pause(2.5 * k + 1.2, 2.5 * k + 2.4) for k in range(6)]
+        return replace(rig, trajectory=rig.trajectory.with_pauses(pauses, ramp_s=0.3))
+
+    run, known = draw(seed, 12.0, target_free=True, change=paused)
+    prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=known)
+    fix = frozenset({"intrinsics"}) if known else frozenset()
+    record = feed(
+        run,
+        CalibratorSubject(
+            CalibrationOptions(fix=fix, target_free=True, imu_noise=imu_noise(run)), prior, None
+        ),
+    )
+    assert record.started_s() is not None and record.started_s() <= 8.0
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)

@@ -34,6 +34,8 @@ _DAMPING = 1e-12
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
 _LEAST_LANDMARKS = 8  # as many as the eight-point algorithm needs
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
+_BOUNDS = 0.2, 5.0  # of an inverse distance after a step, over that before it
+_ROUNDS = 4  # of looking for distances that a step would move beyond their bounds
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
@@ -147,7 +149,7 @@ class Bundle:
                 if self._refuse(now.view):
                     now.view = self.problem.view(w.observe())
                 now.cleaned = True
-            elif now.damping > _DAMPING:  # with damping, little is predicted
+            elif now.damping > _DAMPING and not now.failures:  # with damping, little is predicted
                 now.relax()
                 continue
             else:
@@ -219,18 +221,24 @@ class Bundle:
         g[at] -= s
         return H, g, inverse, at
 
-    def _bounded(self, normal: Normal) -> Normal:
-        """Normal equations with distances held that would go beyond infinity, where no landmark may be.
+    def _displaced(self, normal: Normal, change: FloatArray) -> tuple[Normal, float]:
+        """Normal equations after inverse distances have changed, and by how much that lowers the squares.
 
-        A step that moves them never brings the predicted reduction. [Bertsekas, "Projected Newton methods for
-        optimization problems with simple constraints", 1982]
+        Args:
+            normal: Before.
+            change: Of each inverse distance, which then stays, 1/m, shape (L,); nan: it remains an unknown.
         """
-        held = (self.window.landmarks.inverse < _FAR) & (normal.gl[:, 2] > 0.0)
-        if not held.any():
-            return normal
-        V, W, gl = normal.V.copy(), normal.W.copy(), normal.gl.copy()
-        V[held, 2, :2] = V[held, :2, 2] = gl[held, 2] = W[held, 2] = 0.0
-        return normal._replace(V=V, W=W, gl=gl)
+        fixed = np.isfinite(change)
+        if not fixed.any():
+            return normal, 0.0
+        d, (order, F) = change[fixed], (self.problem.order(), len(self.window.frames))
+        V, W, gl, g = normal.V.copy(), normal.W.copy(), normal.gl.copy(), normal.g.copy()
+        less = -float((2.0 * gl[fixed, 2] + V[fixed, 2, 2] * d) @ d)
+        at = np.concatenate([order.frames[:, :6].reshape(6 * F), order.camera])
+        g[at] += d @ W[fixed, 2]
+        gl[fixed, :2] += V[fixed, :2, 2] * d[:, None]
+        V[fixed, 2, :2] = V[fixed, :2, 2] = gl[fixed, 2] = W[fixed, 2] = 0.0
+        return normal._replace(V=V, W=W, gl=gl, g=g), less
 
     def _root(self, normal: Normal) -> FloatArray | None:
         """Cholesky factor of the states' matrix without landmarks, see `_in_place`; None: not positive."""
@@ -241,8 +249,33 @@ class Bundle:
         return None if info else root
 
     def _step(self, normal: Normal, lam: float) -> _Step | None:
-        """Step of states and landmarks; None where the matrix is not positive."""
-        whole, normal = normal, self._bounded(normal)
+        """Step of states and landmarks; None where the matrix is not positive.
+
+        No distance may go beyond infinity, nor change by more than `_BOUNDS` in a step. One that would is
+        set to its bound, and all else is found with it there: a step that is cut off afterwards need not
+        lower anything. [Bertsekas, "Projected Newton methods for optimization problems with simple
+        constraints", 1982]
+        """
+        inverse = self.window.landmarks.inverse
+        low = np.where(inverse < _FAR, 0.0, (_BOUNDS[0] - 1.0) * inverse)
+        high = (_BOUNDS[1] - 1.0) * inverse + 10.0 * _FAR
+        change = np.where((inverse < _FAR) & (normal.gl[:, 2] > 0.0), 0.0, np.nan)
+        for _ in range(_ROUNDS):
+            step = self._unbounded(*self._displaced(normal, change), lam)
+            if step is None:
+                return None
+            free = np.isnan(change)
+            step.landmarks[~free, 2] = change[~free]
+            wanted = step.landmarks[:, 2]
+            beyond = free & ((wanted < low) | (wanted > high))
+            if not beyond.any():
+                break
+            change[beyond] = np.clip(wanted, low, high)[beyond]
+        np.clip(wanted, low, high, out=wanted)
+        return step if free.all() else step._replace(root=None)
+
+    def _unbounded(self, normal: Normal, less: float, lam: float) -> _Step | None:
+        """Step without bounds; `less` is by how much the squares fall before it."""
         for _ in range(6):
             try:
                 H, g, inverse, at = self._reduced(normal, lam)
@@ -256,8 +289,8 @@ class Bundle:
                 right = normal.gl + np.matmul(normal.W, dx[at])
                 own = np.matmul(inverse, normal.gl[..., None])
                 dl = -np.matmul(np.swapaxes(inverse, 1, 2), np.matmul(inverse, right[..., None]))[..., 0]
-                exact = normal is whole and lam <= _DAMPING
-                return _Step(dx, dl, float((own**2).sum() - g @ dx), root if exact else None)
+                less += float((own**2).sum() - g @ dx)
+                return _Step(dx, dl, less, root if lam <= _DAMPING else None)
             lam = max(10.0 * lam, 1e-6)
         return None
 
@@ -278,8 +311,7 @@ class Bundle:
         m = w.landmarks
         bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-        inverse = np.clip(m.inverse + dl[:, 2], 0.2 * m.inverse, 5.0 * m.inverse + 0.01)
-        w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
+        w.landmarks = Landmarks(m.ids, m.anchor, bearing, m.inverse + dl[:, 2])
         return self.problem.view(seen)
 
     # ------------------------------------------------------------------ noise, outliers, result

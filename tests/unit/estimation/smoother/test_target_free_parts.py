@@ -259,6 +259,39 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
 
 
+def test_a_step_is_the_best_within_the_bounds_of_the_distances(scene):
+    """Against the quadratic model itself: no gradient where it is free, and few held for nothing."""
+    window = scene.window(numbers=16)
+    bundle = bundle_of(window, window_layout("radtan"), 0.3)
+    seen = window.observe()
+    window.landmarks.inverse[::3] = 0.01  # 100 m, of a room of 6 m
+    normal, order = bundle.problem.normal(bundle.problem.view(seen)), bundle.problem.order()
+    step = bundle._step(normal, 0.0)
+    n, marks = len(normal.g), len(normal.gl)
+    pixels = np.concatenate([order.frames[:, :6].ravel(), order.camera])
+    M = np.zeros((n + 3 * marks, n + 3 * marks))
+    M[:n, :n] = np.triu(normal.H) + np.triu(normal.H, 1).T
+    for k in range(marks):
+        at = slice(n + 3 * k, n + 3 * k + 3)
+        M[at, at], M[at, pixels], M[pixels, at] = normal.V[k], normal.W[k], normal.W[k].T
+    x = np.concatenate([step.states, step.landmarks.ravel()])
+    gradient = np.concatenate([normal.g, normal.gl.ravel()]) + M @ x
+    before = window.landmarks.inverse
+    low, high = 0.2 * before, 5.0 * before + 0.01
+    after = before + step.landmarks[:, 2]
+    held = np.isclose(after, low) | np.isclose(after, high)
+    assert 3 <= held.sum() < marks / 2
+    assert (after >= low - 1e-12).all() and (after <= high + 1e-12).all()
+    free = np.ones(n + 3 * marks, bool)
+    free[n + 2 :: 3] = ~held
+    scale = np.sqrt(np.diag(M))
+    assert np.abs(gradient / scale)[free].max() < 1e-4 * np.abs(normal.gl[:, 2] / scale[n + 2 :: 3]).max()
+    inward = np.where(after < before, gradient[n + 2 :: 3], -gradient[n + 2 :: 3])[held]
+    assert (inward > 0.0).mean() > 0.8  # some of the first ones would come back
+    lower = -(2.0 * np.concatenate([normal.g, normal.gl.ravel()]) @ x + x @ M @ x)
+    assert step.predicted_reduction == pytest.approx(lower, rel=1e-6)
+
+
 def test_accelerations_at_images_are_those_of_the_motion_however_far_images_are_apart(scene):
     window = scene.window(frames=scene.frames[::5])
     t_s = np.array([t for t, _ in window.frames]) + SHIFT_S
