@@ -24,6 +24,7 @@ from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.smoother import target_free_initializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
@@ -282,6 +283,15 @@ def test_standing_still_gives_no_answer_and_says_what_to_do():
     assert record.statuses[-1][1] == "degenerate"
     assert "stands still" in record.statuses[-1][2]
     assert "turn it back and forth" in record.guidance
+
+
+def test_in_motion_too_slow_for_an_answer_no_mounting_is_looked_for(monkeypatch):
+    """At 1 deg/s every one of 600 mountings at 5 time shifts fits; each attempt took a second to see that."""
+    run = simulate_tracks(4, 8.0, rig=reference_rig(4, mean_rate_dps=1.0), camera_rate_hz=10.0)
+    monkeypatch.setattr(target_free_initializer, "likely_mountings", lambda *_: pytest.fail("looked for"))
+    record = feed(run, subject_for(run))
+    assert not record.snapshots
+    assert "no motion" in record.statuses[-1][2] or "stands still" in record.statuses[-1][2]
 
 
 @pytest.mark.parametrize("seed", [42, 405], ids=["features soon lost", "narrow lens"])

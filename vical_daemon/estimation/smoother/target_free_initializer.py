@@ -249,7 +249,7 @@ class TargetFreeInitializer:
             shifts = np.array([shift])
             if prior.T_imu_cam is not None:
                 seeds.append((prior.T_imu_cam[0].copy(), shift))
-        if result.status != "ok" and look_around:
+        if result.status != "ok" and look_around and not result.still:
             lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
             seeds += likely_mountings(t, gyro, frames, lens, shifts, known)
         return seeds, result.reason if known is None else ""
