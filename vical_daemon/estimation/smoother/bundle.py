@@ -149,7 +149,7 @@ class Bundle:
                 if self._refuse(now.view):
                     now.view = self.problem.view(w.observe())
                 now.cleaned = True
-            elif now.damping > _DAMPING and not now.failures:  # with damping, little is predicted
+            elif now.damping > _DAMPING:  # with damping, little is predicted
                 now.relax()
                 continue
             else:
