@@ -137,7 +137,7 @@ class Bundle:
         """Iterate until nothing changes or `most` steps are done; None where it does not hold together."""
         w, now = self.window, self._present()
         for steps in range(1, most + 1):
-            step = None if now is None else self._step(now.normal, now.damping)
+            step = None if now is None else self._step(now.normal, now.damping, _ROUNDS if now.cleaned else 1)
             if now is None or step is None:
                 return None
             if step.predicted_reduction >= (DONE if now.cleaned else _SMALL * now.normal.cost):
@@ -248,19 +248,24 @@ class Bundle:
             return None
         return None if info else root
 
-    def _step(self, normal: Normal, lam: float) -> _Step | None:
+    def _step(self, normal: Normal, lam: float, rounds: int) -> _Step | None:
         """Step of states and landmarks; None where the matrix is not positive.
 
         No distance may go beyond infinity, nor change by more than `_BOUNDS` in a step. One that would is
-        set to its bound, and all else is found with it there: a step that is cut off afterwards need not
-        lower anything. [Bertsekas, "Projected Newton methods for optimization problems with simple
-        constraints", 1982]
+        set to its bound, and all else is found with it there. [Bertsekas, "Projected Newton methods for
+        optimization problems with simple constraints", 1982]
+
+        Args:
+            normal: About the present values.
+            lam: Damping, of the diagonal.
+            rounds: Of looking for distances beyond their bounds; those of the last are only cut off. Far from
+                the solution one: what is left of the step lowers the squares all the same.
         """
         inverse = self.window.landmarks.inverse
         low = np.where(inverse < _FAR, 0.0, (_BOUNDS[0] - 1.0) * inverse)
         high = (_BOUNDS[1] - 1.0) * inverse + 10.0 * _FAR
         change = np.where((inverse < _FAR) & (normal.gl[:, 2] > 0.0), 0.0, np.nan)
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             step = self._unbounded(*self._displaced(normal, change), lam)
             if step is None:
                 return None
