@@ -201,7 +201,7 @@ class CalibrationFilter:
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
         innovation = image.uv - lin.z
-        predicted = np.where(lin.valid[:, None], lin.z, np.nan)
+        predicted = lin.z if lin.valid.all() else np.where(lin.valid[:, None], lin.z, np.nan)
         keep, blur = lin.valid & self._belonging(image, innovation, lin), 1.0
         if 2 * np.count_nonzero(keep) < np.count_nonzero(lin.valid):
             blur = blurred(image, innovation, lin)
@@ -332,7 +332,7 @@ class CalibrationFilter:
             if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
                 unscented.turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
         g = self.state.gravity
-        turn = np.cross(g, dx[GRAVITY]) / (g @ g)
+        turn = so3.hat(g) @ dx[GRAVITY] / (g @ g)
         if max(abs(turn)) > 2.0 * _TURNED_RAD:
             unscented.turn_rows(S, GRAVITY, so3.exp_one(turn))
         self.S = S

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.lapack import dgelss
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
@@ -204,9 +205,10 @@ class ImuBuffer:
         t = near[:, 0] - t_s
         span_s = np.abs(t).max()
         u = t / span_s
-        powers = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
-        found = np.linalg.lstsq(powers, near[:, 1:], rcond=_DISTINCT)[0]
-        return np.asarray(found[1:] / np.array([[span_s], [span_s**2]]))
+        powers = np.ones((len(u), 3))
+        powers[:, 1], powers[:, 2] = u, 0.5 * u * u
+        _, found, _, _, _, info = dgelss(powers, near[:, 1:], cond=_DISTINCT)
+        return None if info else np.asarray(found[1:3] / np.array([[span_s], [span_s**2]]))
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
