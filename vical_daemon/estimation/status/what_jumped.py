@@ -362,4 +362,5 @@ def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) 
     if not f.finite():
         return -math.inf, False
     report = step(f, image[1], image[0])
+    f.passed.clear()  # nobody asks, and copies would contain it
     return (0.0, False) if report is None else (report.log_likelihood, report.used)
