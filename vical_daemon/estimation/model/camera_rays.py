@@ -148,7 +148,8 @@ def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArr
             e = distort(xy, D) - target
             a, b, c = radtan_derivative(x, y, x * x + y * y, D)
             det = a * c - b * b
-            step = np.stack((c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]), axis=-1)
+            step = np.empty(xy.shape)
+            step[..., 0], step[..., 1] = c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]
             step /= det[..., None]
             xy = xy - step
             error = np.where(beyond, np.inf, np.abs(step).max(axis=-1))
