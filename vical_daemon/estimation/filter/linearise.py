@@ -32,8 +32,8 @@ from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5
-"""A sigma this many times larger than when it was measured: measure again. Up to 5 times where the second-order
-part, which grows with the square, is then still a quarter of what is straight."""
+"""A sigma so many times larger than when it was measured: measure again. Up to 5 times where the second-order
+part is then a quarter of what is straight: it grows with the square."""
 _FAR_PX = 1e5  # pixels of a point that is not in front of the camera
 _STEP = 1e-3  # of a sigma: so small that differences are derivatives
 _ROW_STEPS = 2  # to the row that shows a corner; each leaves a tenth of the error at most
