@@ -31,9 +31,7 @@ from vical_daemon.estimation.model.target_view import view
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
-_GROWN = 1.5
-"""A sigma so many times larger than when it was measured: measure again. Up to 5 times where the second-order
-part is then a quarter of what is straight: it grows with the square."""
+_GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
 _FAR_PX = 1e5  # pixels of a point that is not in front of the camera
 _STEP = 1e-3  # of a sigma: so small that differences are derivatives
 _ROW_STEPS = 2  # to the row that shows a corner; each leaves a tenth of the error at most
@@ -304,7 +302,6 @@ class LinearityMonitor:
         return self.left > 0 and len(self.limits) == len(sigmas) and bool((sigmas <= self.limits).all())
 
     def measured(self, sigmas: FloatArray, share: float) -> None:
-        """Take a measurement: second-order part over noise at these sigmas; it grows with their squares."""
-        grown = max(0.5 * math.sqrt(_FLAT / max(share, 0.01 * _FLAT)), _GROWN)
-        self.limits = grown * sigmas if share < _FLAT else np.zeros(0)
+        """Take a measurement: second-order part over noise at these sigmas."""
+        self.limits = _GROWN * sigmas if share < _FLAT else np.zeros(0)
         self.left = _TRUST

@@ -204,17 +204,9 @@ def test_straightness_is_measured_again_when_a_sigma_grows_or_time_passes():
     s = LinearityMonitor()
     sigmas = np.array([1.0, 2.0])
     assert not s.holds(sigmas)
-    s.measured(sigmas, 0.01)
+    s.measured(sigmas, 0.001)
     assert s.holds(1.4 * sigmas)
     assert not s.holds(1.6 * sigmas)
     assert sum(s.holds(sigmas) for _ in range(200)) < 100
     s.measured(sigmas, 0.5)
     assert not s.holds(sigmas)
-
-
-@pytest.mark.parametrize(("share", "times"), [(0.01, 1.5), (1e-3, 0.5 * 20.0**0.5), (0.0, 5.0)])
-def test_straightness_holds_while_the_second_order_part_stays_small(share, times):
-    s, sigmas = LinearityMonitor(), np.array([1.0, 2.0])
-    s.measured(sigmas, share)
-    assert s.holds(0.99 * times * sigmas)
-    assert not s.holds(1.01 * times * sigmas)
