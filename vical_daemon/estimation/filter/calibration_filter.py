@@ -48,7 +48,7 @@ from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import ROUNDING
 from vical_daemon.estimation.model.rates import Rates, rates_after
-from vical_daemon.estimation.model.retract import orthonormal, retract
+from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -141,7 +141,7 @@ class CalibrationFilter:
             self._drift(self.jumped.D, self.jumped.D, moved.seconds)
         self._grow(moved, Q)
         self._predict_score(moved, Q)
-        state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
+        state.R_world_imu, state.p_world_imu, state.v_world_imu = moved.R, moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self.rates = rates_after(state, segment, self.rates)
 
@@ -201,7 +201,7 @@ class CalibrationFilter:
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
         innovation = image.uv - lin.z
-        predicted = np.where(lin.valid[:, None], lin.z, np.nan)
+        predicted = lin.z if lin.valid.all() else np.where(lin.valid[:, None], lin.z, np.nan)
         keep, blur = lin.valid & self._belonging(image, innovation, lin), 1.0
         if 2 * np.count_nonzero(keep) < np.count_nonzero(lin.valid):
             blur = blurred(image, innovation, lin)
@@ -224,7 +224,9 @@ class CalibrationFilter:
         self.passed.append(Corrected(before, self.S, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
         keep = fit.keep
-        residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
+        residual = fit.left * image.sigma_px[:, None]
+        if self.layout.held:
+            residual += self._by_held(lin)
         self.consistency[image.camera].learn(
             image.t_cam_s,
             lin.z[keep],
@@ -250,9 +252,7 @@ class CalibrationFilter:
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
-        """Contribution of a fixed lens's errors to the residuals, px, shape (n, 2), or 0."""
-        if not self.layout.held:
-            return np.zeros(())
+        """Contribution of a fixed lens's errors to the residuals, px, shape (n, 2)."""
         lenses = self.layout.held.items()
         rows = np.concatenate([self.S[self.layout.lens(name)] for name, _ in lenses])
         cameras = self.mean.cameras
@@ -332,7 +332,7 @@ class CalibrationFilter:
             if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
                 unscented.turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
         g = self.state.gravity
-        turn = np.cross(g, dx[GRAVITY]) / (g @ g)
+        turn = so3.hat(g) @ dx[GRAVITY] / (g @ g)
         if max(abs(turn)) > 2.0 * _TURNED_RAD:
             unscented.turn_rows(S, GRAVITY, so3.exp_one(turn))
         self.S = S

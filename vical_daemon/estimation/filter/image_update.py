@@ -101,8 +101,8 @@ def whitened(image: Image, lin: Linear, fit: ImageFit) -> tuple[FloatArray, Floa
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    covariance = lin.spread @ lin.spread.T + lin.shared @ lin.shared.T
-    var = np.vecdot(lin.ways @ covariance, lin.ways)
+    moves = lin.moves
+    var = np.vecdot(lin.ways @ (moves @ moves.T), lin.ways)
     if lin.curved.size:
         var += np.vecdot(lin.curved, lin.curved)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
@@ -170,15 +170,6 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
     return fit
 
 
-def _moved(solution: FloatArray, spread: FloatArray, shared: FloatArray) -> FloatArray:
-    """How far a solution moves the image in each way, shape (k,), and what it leaves to the curvature."""
-    n = spread.shape[1]
-    if len(solution) == n:
-        return np.asarray(spread @ solution)
-    m = n + shared.shape[1]
-    return np.concatenate([spread @ solution[:n] + shared @ solution[n:m], solution[m:]])
-
-
 def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     """Sum of squares and number of the rows that no state moves."""
     alone = np.vecdot(rows, rows) < _ALONE
@@ -197,17 +188,19 @@ def _correct(
         curved = lin.curved * weight[:, None]
         if float(np.vecdot(curved, curved).max(initial=0.0)) > 1e-4:
             ways = np.concatenate([ways, curved], axis=1)
+    moves = np.concatenate([spread, lin.shared], axis=1) if lin.shared.size else spread
+    known = moves.shape[1]
     for _ in range(3):
         rows = rows_of(keep)
         kept, r_kept = ways[rows], r[rows]
         R, r_small, rest, dof_rest = unscented.compress(kept, r_kept)
-        small = np.concatenate([R[:, :k] @ spread, R[:, :k] @ lin.shared, R[:, k:]], axis=1)
+        small = np.concatenate([R[:, :k] @ moves, R[:, k:]], axis=1)
         # Rows that no state moves are residuals like the rest, and say nothing about whether innovations fit.
         apart, count = _unmoved(small, r_small) if dof_rest else (0.0, 0)
         rest, dof_rest = rest + apart, dof_rest + count
         noise = noise_of_image(rest * image.scale, dof_rest)
         c = unscented.correct(prior, small / noise, r_small / noise)
-        moved = _moved(c.solution, spread, lin.shared)
+        moved = np.concatenate([moves @ c.solution[:known], c.solution[known:]])
         left = (r - ways @ moved).reshape(-1, 2)
         bad = keep & (np.vecdot(left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or np.count_nonzero(keep & ~bad) < LEAST_POINTS:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.lapack import dgelss
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
@@ -202,11 +203,14 @@ class ImuBuffer:
         if len(near) < 3:
             return None
         t = near[:, 0] - t_s
-        span_s = np.abs(t).max()
-        u = t / span_s
-        powers = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
-        found = np.linalg.lstsq(powers, near[:, 1:], rcond=_DISTINCT)[0]
-        return np.asarray(found[1:] / np.array([[span_s], [span_s**2]]))
+        span_s = max(-float(t[0]), float(t[-1]))
+        powers = np.ones((len(t), 3))
+        powers[:, 1] = u = t / span_s
+        powers[:, 2] = 0.5 * u * u
+        _, found, _, _, _, info = dgelss(powers, near[:, 1:], cond=_DISTINCT)
+        found[1] /= span_s
+        found[2] /= span_s**2
+        return None if info else np.asarray(found[1:3])
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -235,13 +239,17 @@ class ImuBuffer:
         value, change = _hermite(here, slope, t_s, k)
         begin = np.zeros(len(t_s), np.intp)
         (inside + 2).cumsum(out=begin[1:])
-        at = np.arange(begin[-1]) + (after[:-1] - begin[:-1] - 1).repeat(inside + 2)
-        nodes, rise = (x.take(at - first, axis=0, mode="clip") for x in (here, slope))
-        for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
-            nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
+        read = np.concatenate([here, slope], axis=1)
+        rows = np.concatenate([read, np.concatenate([t_s[:, None], value, change], axis=1)])
+        at = np.arange(begin[-1]) + (after[:-1] - begin[:-1] - 1 - first).repeat(inside + 2)
+        ends = np.arange(len(read), len(rows))
+        at[begin[:-1]], at[begin[1:] - 1] = ends[:-1], ends[1:]
+        nodes = rows[at]
         gap = float((t[first + 1 : last + 1] - t[first:last]).max())
-        sigma = self._clipping_sigma_at(slice(first, last + 1), at - first, k, t_s, begin)
-        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], sigma)
+        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, t_s, begin)
+        segment = ImuSegment(
+            *(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:7], gap, nodes[:, 7:10], nodes[:, 10:], sigma)
+        )
         return segment, begin[:-1]
 
     def _clipping_sigma_at(

@@ -94,7 +94,7 @@ def _of_sensor(rows: FloatArray, columns: slice) -> float | None:
     whole = ~sliding_window_view(broken, _LENGTH - 1)[:: _LENGTH // 2].any(axis=1)
     if whole.sum() < _LEAST or first > _LENGTH * 3 // 8:
         return None
-    stretches = sliding_window_view(values, _LENGTH, axis=0)[:: _LENGTH // 2][whole]
+    stretches = np.ascontiguousarray(sliding_window_view(values, _LENGTH, axis=0)[:: _LENGTH // 2][whole])
     window = np.hanning(_LENGTH)
     spectrum = np.abs(np.fft.rfft(_detrended(stretches) * window)) ** 2 / float(window @ window)
     bands = np.array_split(spectrum[:, :, first:-1], _BANDS, axis=2)

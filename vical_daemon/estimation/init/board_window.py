@@ -296,7 +296,7 @@ class BoardWindow:
             turned, camera = orthonormal(R @ so3.exp_one(d[:3])), node.frames[0][1].camera
             arm, now = before[camera].p_imu_cam, self.state.cameras[camera].p_imu_cam
             # The camera goes where the linear step has it: the product of both changes would displace it.
-            seen = p + d[3:6] + R @ (now + np.cross(d[:3], arm))
+            seen = p + d[3:6] + R @ (now + so3.hat(d[:3]) @ arm)
             node.at = Instant(t_s, turned, seen - turned @ now, v + d[6:])
         self._find_rates()
 

@@ -142,19 +142,29 @@ def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArr
     xy = target * start[..., None]
     error = np.full(shape, np.inf)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        beyond = r_d > _reach(D, limit)
         for _ in range(MOST_STEPS):
             x, y = xy[..., 0], xy[..., 1]
             e = distort(xy, D) - target
             a, b, c = radtan_derivative(x, y, x * x + y * y, D)
             det = a * c - b * b
-            step = np.stack((c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]), axis=-1)
+            step = np.empty(xy.shape)
+            step[..., 0], step[..., 1] = c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]
             step /= det[..., None]
             xy = xy - step
-            error = np.abs(step).max(axis=-1)
-            if not np.any(error > _NEWTON_DONE):
+            error = np.where(beyond, np.inf, np.abs(step).max(axis=-1))
+            if not np.any((error > _NEWTON_DONE) & ~beyond):
                 break
         ok = (error <= _NEWTON_DONE) & (np.hypot(xy[..., 0], xy[..., 1]) < limit) & (det > 0.0)
     return np.where(ok[..., None], xy, np.nan), ok
+
+
+def _reach(D: FloatArray, limit: FloatArray) -> FloatArray:
+    """Largest radius, in normalised units, at which a radtan lens may show a ray within `valid_radius`."""
+    s, k3 = limit * limit, D[..., 4] if D.shape[-1] == 5 else 0.0
+    tangential = 3.0 * (np.abs(D[..., 2]) + np.abs(D[..., 3])) * s
+    reach = limit * (1.0 + s * (D[..., 0] + s * (D[..., 1] + s * k3))) + tangential
+    return np.where(np.isfinite(limit), reach, np.inf)
 
 
 def _undistort_theta(theta_d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -51,7 +51,7 @@ def rates_at(
     if trend is None:
         return Rates(omega, force + state.gravity, *before[2:])
     alpha, jerk = trend[:, :3] @ state.gyro_matrix.T
-    jolt = state.accel_matrix @ trend[0, 3:] - so3.cross(omega, state.gravity @ R)
+    jolt = state.accel_matrix @ trend[0, 3:] - so3.hat(omega) @ (state.gravity @ R)
     return Rates(omega, force + state.gravity, alpha, jerk, jolt)
 
 

@@ -348,10 +348,12 @@ def _suspects(
     if taken[-1].used and max(x.max() for x in ratios.values()) < odds:
         return []
     best = {part: int(x.argmax()) for part, x in ratios.items()}
-    # images that are refused tell the scores nothing; a large jump may be just before the first of them
     likely = sorted(best, key=lambda part: -ratios[part].max())
     first = [(part, best[part]) for part in likely]
-    rest = [(part, near) for part, k in first for near in sorted({k - 1, k + 1, *refused[:1]} - {k})]
+    if not refused:
+        return [(part, k) for part, k in first if ratios[part][k] > 0.0]
+    # images that are refused tell the scores nothing; a large jump may be just before the first of them
+    rest = [(part, near) for part, k in first for near in sorted({k - 1, k + 1, refused[0]} - {k})]
     return [(part, k) for part, k in first + rest if 0 <= k < len(taken)]
 
 
@@ -360,4 +362,5 @@ def _follow(f: CalibrationFilter, image: tuple[float, PointsFrame], step: Step) 
     if not f.finite():
         return -math.inf, False
     report = step(f, image[1], image[0])
+    f.passed.clear()  # nobody asks, and copies would contain it
     return (0.0, False) if report is None else (report.log_likelihood, report.used)

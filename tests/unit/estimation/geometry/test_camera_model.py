@@ -108,6 +108,18 @@ def test_pixels_that_no_ray_reaches_are_refused():
     assert np.isinf(cr.valid_radius(np.zeros(4)))
 
 
+@pytest.mark.parametrize("tangential", [0.0, 2e-3])
+def test_pixels_that_no_ray_reaches_do_not_hold_up_the_others(monkeypatch, tangential):
+    steps, derivative = [], cr.radtan_derivative
+    monkeypatch.setattr(cr, "radtan_derivative", lambda *args: steps.append(args) or derivative(*args))
+    K, D = np.array([460.0, 460.0, 365.0, 249.0]), np.array([-0.335, 0.192, tangential, -tangential, -0.079])
+    pixels = np.array([[1500.0, 249.0], [300.0, 200.0], [365.0, 249.0]])
+    rays, ok = cr.unproject(pixels, K, D, cm.PLUMB_BOB)
+    assert ok.tolist() == [False, True, True]
+    np.testing.assert_allclose(cm.project(rays[1:], K, D, cm.PLUMB_BOB), pixels[1:], atol=1e-9)
+    assert len(steps) < 10
+
+
 def test_the_fifth_coefficient_moves_the_fold():
     r = cr.valid_radius(D_PLUMB_BOB)
     across = np.linspace(0.0, r, 1000)[:, None] * [1.0, 0.0]

@@ -5,8 +5,9 @@ import numpy as np
 from tests.unit.estimation.some_filter import NAME, some_filter
 from vical_daemon.estimation.filter.jump_scores import Corrected
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.status import what_jumped as module
 from vical_daemon.estimation.status.recent_past import Taken
-from vical_daemon.estimation.status.what_jumped import what_jumped
+from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 
 
 def images(f, innovation):
@@ -34,3 +35,18 @@ def test_images_that_a_jump_explains_are_followed_again():
 
     what_jumped(f, images(f, np.full(3, 1e3)), NAME, step)
     assert followed
+
+
+def test_without_refused_images_each_likely_part_is_tried_at_one_instant(monkeypatch):
+    f, tried = some_filter()[0], []
+    monkeypatch.setattr(module, "_follow_after", lambda _, parts, of, *__: tried.append((*parts, len(of))))
+    taken = images(f, np.full(3, 1e3))
+    what_jumped(f, taken, NAME, lambda *_: None)
+    parts = [part for part, _ in tried]
+    assert len(parts) == len(set(parts))
+    assert Part.MOUNTING in parts
+    assert Part.DRIFT not in parts  # the images hardly show it, so it cannot explain them
+    tried.clear()
+    what_jumped(f, [taken[0]._replace(used=False), *taken[1:]], NAME, lambda *_: None)
+    assert {part for part, _ in tried} > set(parts)  # the scores do not include that image
+    assert len({at for part, at in tried if part is Part.MOUNTING}) > 1
