@@ -22,6 +22,7 @@ measured turns with the gyro."""
 _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
+_SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
 _UNIT = 1e-2  # quaternions written with three digits
 _JUMP = 0.3  # rad/s, or of gravity: no motion does that from one reading to the next and back
@@ -59,7 +60,8 @@ def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[st
     constant = _constant_channels(samples)
     ratio, correlation = gyro_scale(samples, rate_hz)
     _check_accelerometer(name, samples, constant, correlation)
-    _check_gyro(name, ratio, correlation)
+    if mistake := _gyro_mistake(ratio, correlation):
+        raise RecordingError(f"{name}: {mistake}")
     return [f"{name}: {constant}"] * bool(constant) + _gaps(name, samples.t_ns, rate_hz)
 
 
@@ -113,7 +115,7 @@ def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlati
     first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
     if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
         text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
-    elif _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
+    elif (_LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro) or _swapped(samples, correlation):
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
     elif constant:
         text = constant
@@ -126,13 +128,20 @@ def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlati
     elif 0.6 < median < 1.6:
         text = f"it looks like g: multiply by {GRAVITY_MPS2}"
     elif 600 < median < 1600:
-        text = f"it looks like mg: multiply by {GRAVITY_MPS2 / 1000}"
+        text = f"it looks like mg (multiply by {GRAVITY_MPS2 / 1000}) or cm/s^2 (by 0.01)"
     else:
         text = "check its unit"
     raise RecordingError(
         f"{name}: the accelerometer reads {median:.3g} in the middle, m/s^2 (about {GRAVITY_MPS2:.1f}) are "
         f"expected; {text}"
     )
+
+
+def _swapped(samples: ImuArrays, correlation: float) -> bool:
+    """Whether what is read as rates turns with what is read as forces, and not the other way round."""
+    other = ImuArrays(samples.t_ns, samples.specific_force_mps2, samples.gyro_rps)
+    rate_hz = 1e9 / float(np.median(np.diff(samples.t_ns)))
+    return correlation < _TURNS_WITH_GYRO and gyro_scale(other, rate_hz)[1] > _SURELY_TURNS
 
 
 def _constant_channels(samples: ImuArrays) -> str:
@@ -151,17 +160,25 @@ def _constant_channels(samples: ImuArrays) -> str:
     return f"not even noise changes {words}; does the driver read this axis?"
 
 
-def _check_gyro(name: str, ratio: float, correlation: float) -> None:
+def gyro_mistake(samples: ImuArrays) -> str:
+    """Say that the gyro's unit is wrong, by how gravity turns in the accelerometer; empty: nothing shows it.
+
+    Args:
+        samples: In order of their stamps.
+    """
+    if len(samples.t_ns) < 2:
+        return ""
+    step_ns = float(np.median(np.diff(samples.t_ns)))
+    return _gyro_mistake(*gyro_scale(samples, 1e9 / step_ns)) if step_ns > 0 else ""
+
+
+def _gyro_mistake(ratio: float, correlation: float) -> str:
+    shows = "what the turning of gravity in the accelerometer shows; rad/s are expected"
     if correlation > _TURNS_WITH_GYRO and 0.004 < ratio < 0.07:
-        raise RecordingError(
-            f"{name}: the gyro reads {1 / ratio:.0f} times what the turning of gravity in the accelerometer "
-            "shows; rad/s are expected, it looks like deg/s: multiply by pi/180"
-        )
+        return f"the gyro reads {1 / ratio:.0f} times {shows}, it looks like deg/s: multiply by pi/180"
     if correlation > _TURNS_WITH_GYRO and ratio > 15:
-        raise RecordingError(
-            f"{name}: the gyro reads only 1/{ratio:.0f} of what the turning of gravity in the accelerometer "
-            "shows; rad/s are expected, check its unit"
-        )
+        return f"the gyro reads only 1/{ratio:.0f} of {shows}, check its unit"
+    return ""
 
 
 def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
