@@ -39,9 +39,12 @@ from vical_daemon.logs.model import (
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers, set_back_s
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
+from vical_daemon.logs.two_tables import one_table, read_sensor, two_tables
+from vical_daemon.logs.united_imu import forces_at
 from vical_daemon.logs.what_is_there import images_in, what_is_there
 
 RIG = "rig0"
+_UNITED = "imu0"  # name of an IMU of two tables
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
@@ -106,6 +109,8 @@ class AslRecording(Recording):
         for name, table in imus.items():
             if names is None or name in names:
                 self._sources.append(self._read_imu(table, name))
+        if not imus and (names is None or _UNITED in names):
+            self._sources.extend(self._imu_of_others(root))
         folders = sorted(path for path in root.glob("cam*") if path.is_dir())
         wanted = [path for path in folders if path.name in cameras] or folders
         for camera in wanted:
@@ -145,9 +150,42 @@ class AslRecording(Recording):
             source = sources[which]
             yield source.stream.key, source.build(i)
 
+    def _imu_of_others(self, root: Path) -> list[_Source]:
+        """Return the IMU of a folder whose tables have other names; []: there is none."""
+        if (table := one_table(root)) is not None:
+            self.warnings.append(f"{_UNITED}: {table.name} is read, whose title names all six axes")
+            return [self._read_imu(table, _UNITED)]
+        pair = two_tables(root)
+        return [] if pair is None else [self._read_two(*pair)]
+
+    def _read_two(self, gyro_path: Path, accel_path: Path) -> _Source:
+        """Make one IMU of the tables of a gyro and an accelerometer."""
+        gyro, accel = read_sensor(gyro_path), read_sensor(accel_path)
+        rows = np.empty(len(gyro.t_ns), _IMU_ROW)
+        rows["t"], rows["values"][:, :3] = gyro.t_ns, gyro.axes
+        rows["values"][:, 3:] = forces_at(gyro.t_ns, accel.t_ns, accel.axes)
+        within = np.flatnonzero(np.isfinite(rows["values"][:, 3]))
+        if not len(within):
+            raise RecordingError(
+                f"{gyro_path} and {accel_path.name} were not recorded at the same time by their stamps"
+            )
+        rows = rows[within[0] : within[-1] + 1]
+        self._note_stamps(_UNITED, float(np.hypot(gyro.sigma_s, accel.sigma_s)), gyro.report)
+        used = f"the gyro of {gyro_path.name}, and the accelerometer of {accel_path.name}"
+        self.warnings.append(f"{_UNITED}: {used} interpolated to its stamps")
+        return self._imu_source(rows, _UNITED, gyro_path)
+
     def _read_imu(self, path: Path, name: str) -> _Source:
         rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+        return self._imu_source(rows, name, path)
+
+    def _imu_source(self, rows: npt.NDArray[Any], name: str, path: Path) -> _Source:
         finite = np.isfinite(rows["values"]).all(axis=1) & rows["values"].any(axis=1)
+        if not finite.any():
+            raise RecordingError(
+                f"{path}: no row holds both gyro and accelerometer; were they read at different times? Write "
+                "each into its own table, gyro.csv and accel.csv"
+            )
         rows = self._even(rows[finite], name)
         if not finite.all():
             text = f"{int((~finite).sum())} samples that are not finite, or all 0, left out"

@@ -1,0 +1,65 @@
+"""Tables with empty cells, a line of units below the title, a mark at the beginning, other line ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vical_daemon.logs import RecordingError, open_recording
+
+TITLE = "timestamp,wx,wy,wz,ax,ay,az"
+
+
+def rewritten(folder, change):
+    path = folder / "mav0/imu0/data.csv"
+    path.write_bytes(change(path.read_text().splitlines()))
+    return open_recording(folder)
+
+
+def lines(rows):
+    return ("\n".join(rows) + "\n").encode()
+
+
+@pytest.mark.parametrize("missing", ["", "NA", " null ", "nan"])
+def test_readings_with_missing_cells_are_left_out_and_counted(tmp_path, write_asl, missing):
+    def change(rows):
+        return lines([*rows[:99], rows[99].split(",")[0] + f",{missing}" * 6, *rows[100:]])
+
+    before = open_recording(write_asl(tmp_path / "a")).imu_arrays("imu0")
+    after = rewritten(write_asl(tmp_path / "b"), change)
+    assert "imu0: 1 samples that are not finite, or all 0, left out" in after.warnings
+    np.testing.assert_array_equal(after.imu_arrays("imu0").gyro_rps, np.delete(before.gyro_rps, 98, axis=0))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows: lines([TITLE, "ns,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2", *rows[1:]]),
+        lambda rows: b"\xef\xbb\xbf" + lines(rows[1:]),
+        lambda rows: lines(rows).replace(b"\n", b"\r"),
+        lambda rows: lines(rows).replace(b"\n", b"\r\n"),
+    ],
+    ids=["units", "BOM", "CR", "CRLF"],
+)
+def test_no_reading_is_lost(tmp_path, write_asl, change):
+    before = open_recording(write_asl(tmp_path / "a")).imu_arrays("imu0")
+    after = rewritten(write_asl(tmp_path / "b"), change).imu_arrays("imu0")
+    np.testing.assert_array_equal(after.t_ns, before.t_ns)
+    np.testing.assert_array_equal(after.gyro_rps, before.gyro_rps)
+
+
+def test_rows_of_one_sensor_in_turns_are_named(tmp_path, write_asl):
+    """As joined tables of a gyro and an accelerometer are."""
+
+    def change(rows):
+        cells = [row.split(",") for row in rows[1:]]
+        return lines(
+            [rows[0]]
+            + [
+                ",".join(c[:4]) + ",,," if k % 2 else f"{c[0]},,,," + ",".join(c[4:])
+                for k, c in enumerate(cells)
+            ]
+        )
+
+    with pytest.raises(RecordingError, match="no row holds both gyro and accelerometer"):
+        rewritten(write_asl(tmp_path / "a"), change)
