@@ -48,6 +48,7 @@ _UNITED = "imu0"  # name of an IMU of two tables
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
+_BLOCK = 4096  # readings that are turned into messages together
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
@@ -194,10 +195,16 @@ class AslRecording(Recording):
         force = np.ascontiguousarray(rows["values"][:, 3:])
         t_ns = np.ascontiguousarray(rows["t"])
         self.imu_tables[name] = ImuArrays(t_ns, gyro, force)
-        stamps, gyro_rows, force_rows = t_ns.tolist(), gyro.tolist(), force.tolist()
+        number, block = -1, list[tuple[int, list[float], list[float]]]()
 
         def build(i: int) -> bytes:
-            return encode_imu(stamps[i], name, gyro_rows[i], force_rows[i])
+            nonlocal number, block
+            if i // _BLOCK != number:  # all rows as Python's numbers would take ten times the arrays
+                number = i // _BLOCK
+                part = slice(number * _BLOCK, (number + 1) * _BLOCK)
+                block = list(zip(t_ns[part].tolist(), gyro[part].tolist(), force[part].tolist(), strict=True))
+            stamp_ns, rates, forces = block[i % _BLOCK]
+            return encode_imu(stamp_ns, name, rates, forces)
 
         return _Source(self._stream("imu", name, path, t_ns), t_ns, build)
 

@@ -28,11 +28,12 @@ _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file 
 
 def without_cut_line(text: bytes, columns: int) -> bytes:
     """Return a table without its last line if that is cut off."""
-    kept, newline, last = text.rpartition(b"\n")
-    if not newline or not last.strip() or last.lstrip().startswith(b"#"):
+    end = text.rfind(b"\n") + 1
+    last = text[end:]
+    if not end or not last.strip() or last.lstrip().startswith(b"#"):
         return text
     cells = last.split(b",")
-    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else kept + newline
+    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else text[:end]
 
 
 def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:

@@ -32,6 +32,7 @@ _NEARER = 5.0
 _JUMPS = 0.2
 """Share of such jumps from which on two devices take turns; 0.3 if one is four times as fast, none on real
 recordings of one."""
+_AT_ONCE = 100_000  # readings that are looked at together: memory
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 _COPY = "is one of the files a copy of another?"
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
@@ -91,10 +92,13 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
 
 def _check_one_device(name: str, samples: ImuArrays) -> None:
     """Refuse the readings of two devices that are mounted differently, in one stream."""
-    six = np.hstack([samples.gyro_rps, samples.specific_force_mps2 / GRAVITY_MPS2])
-    ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
-    jumps = (ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))
-    if jumps.mean() > _JUMPS:
+    jumps, count = 0, len(samples.t_ns)
+    for begin in range(0, count - 5, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE + 5)
+        six = np.hstack([samples.gyro_rps[part], samples.specific_force_mps2[part] / GRAVITY_MPS2])
+        ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
+        jumps += np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0)))
+    if jumps > _JUMPS * (count - 5):
         raise RecordingError(
             f"{name}: its readings jump back and forth between two sets, as if two IMUs shared one topic "
             "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
