@@ -97,7 +97,7 @@ def _check_one_device(name: str, samples: ImuArrays) -> None:
         part = slice(begin, begin + _AT_ONCE + 5)
         six = np.hstack([samples.gyro_rps[part], samples.specific_force_mps2[part] / GRAVITY_MPS2])
         ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
-        jumps += np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0)))
+        jumps += int(np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))))
     if jumps > _JUMPS * (count - 5):
         raise RecordingError(
             f"{name}: its readings jump back and forth between two sets, as if two IMUs shared one topic "
