@@ -12,6 +12,7 @@ from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import main
 
 RIG = reference_rig(3)
@@ -77,3 +78,10 @@ def test_swapped_columns_in_other_units(tmp_path, capsys, runs):
     run = runs["board"]
     swapped = replace(run, gyro_rps=run.specific_force_mps2 / G, specific_force_mps2=run.gyro_rps * DEG)
     assert "columns seem to be swapped" in said(tmp_path, capsys, "info", swapped, False, 1.0, 1.0)
+
+
+def test_a_replay_warns_of_other_units(tmp_path, capsys, runs, monkeypatch):
+    monkeypatch.setattr("vical_daemon.cli.replay._open_bus", lambda _: LocalBus())
+    folder = write_asl(tmp_path / "a", replace(runs["board"], gyro_rps=DEG * runs["board"].gyro_rps))
+    assert main(["replay", str(folder), "--speed", "0"]) == 0
+    assert "deg/s: multiply by pi/180" in capsys.readouterr().err
