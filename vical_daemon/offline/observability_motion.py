@@ -63,7 +63,7 @@ def motion_of(
             f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}"
         )
     stream, prior = cameras[name], prior_of(initial, name)
-    readings = _readings(recording, imu, warn)
+    readings = _readings(recording, imu)
     if target is None and stream.kind != "points":
         return motion_without_board(recording, initial, name, imu, blocks)
     if stream.kind == "tracks":
@@ -90,12 +90,11 @@ def motion_of(
     return motion, _setup(lens, corner_px, result, p_imu_cam, blocks, target), frames
 
 
-def _readings(recording: Recording, imu: str | None, warn: Warn) -> ImuArrays:
+def _readings(recording: Recording, imu: str | None) -> ImuArrays:
     """Return the readings of the imu that is meant, whose units and rate are plausible."""
     name, _, _ = choose_gyro(recording, imu)
     readings = recording.imu_arrays(name)
-    for text in check_imu(name, readings, recording.set_back_s.get(name, 0.0)):
-        warn(text)
+    check_imu(name, readings, recording.set_back_s.get(name, 0.0))
     return readings
 
 
