@@ -26,6 +26,7 @@ from vical_daemon.logs.asl_tables import (
     read_table,
     without_cut_line,
 )
+from vical_daemon.logs.checks import take_turns
 from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.model import (
@@ -48,6 +49,7 @@ _UNITED = "imu0"  # name of an IMU of two tables
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
+_MOST_FRESH = 0.8  # share of stamps that come once; below it two devices may share a table
 _BLOCK = 4096  # readings that are turned into messages together
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
@@ -357,6 +359,12 @@ class AslRecording(Recording):
             rows = rows[np.argsort(rows["t"], kind="stable")]
         if drop_equal and len(rows):
             fresh = np.append(True, np.diff(rows["t"]) > 0)
+            many = fresh.mean() < _MOST_FRESH and name not in self.set_back_s
+            if many and take_turns(rows["values"][:, :3], rows["values"][:, 3:]):
+                raise RecordingError(
+                    f"{name}: {int((~fresh).sum())} rows repeat the stamp of another with other readings, "
+                    "as if two IMUs shared one table; give each its own"
+                )
             if not fresh.all():
                 self.warnings.append(f"{name}: {int((~fresh).sum())} samples with a repeated stamp left out")
                 rows = rows[fresh]

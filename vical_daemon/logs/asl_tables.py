@@ -8,6 +8,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vical_daemon.logs.model import RecordingError
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
 _MISSING = frozenset({b"", b"na", b"n/a", b"null", b"none", b"-"})
+_FIRST_ROWS = 20  # of these one stamp of seconds is not a whole one
 _IMU_COLUMNS = 7  # stamp, 3 rates, 3 forces
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
@@ -87,7 +89,7 @@ def _missing_as_nan(text: bytes, count: int) -> bytes:
 
 
 def _type_read(dtype: np.dtype[Any], name: str, text: bytes, begin: int) -> np.dtype[Any]:
-    """Type as which a column is read: that wanted, unless its first number is a fraction."""
+    """Type as which a column is read: that wanted, unless one of its first numbers is a fraction."""
     column = (dtype.names or ()).index(name)
     if dtype[name].kind != "i" or not _fractional(text, begin, column):
         return dtype[name]
@@ -135,10 +137,12 @@ def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _fractional(text: bytes, begin: int, column: int) -> bool:
-    """Whether the first number of a column is written with a point or an exponent."""
-    _, first = next(_data_lines(text, begin), (0, b""))
-    cell = (first.split(b",") + [b""] * column)[column].lower()
-    return b"." in cell or b"e" in cell
+    """Whether one of the first numbers of a column is written with a point or an exponent (0, 0.005, ...)."""
+    for _, line in islice(_data_lines(text, begin), _FIRST_ROWS):
+        cell = (line.split(b",") + [b""] * column)[column].lower()
+        if b"." in cell or b"e" in cell:
+            return True
+    return False
 
 
 def columns_of(dtype: np.dtype[Any]) -> int:

@@ -92,17 +92,22 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
 
 def _check_one_device(name: str, samples: ImuArrays) -> None:
     """Refuse the readings of two devices that are mounted differently, in one stream."""
-    jumps, count = 0, len(samples.t_ns)
-    for begin in range(0, count - 5, _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE + 5)
-        six = np.hstack([samples.gyro_rps[part], samples.specific_force_mps2[part] / GRAVITY_MPS2])
-        ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
-        jumps += int(np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))))
-    if jumps > _JUMPS * (count - 5):
+    if take_turns(samples.gyro_rps, samples.specific_force_mps2):
         raise RecordingError(
             f"{name}: its readings jump back and forth between two sets, as if two IMUs shared one topic "
             "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
         )
+
+
+def take_turns(gyro_rps: FloatArray, specific_force_mps2: FloatArray) -> bool:
+    """Whether readings, shapes (n, 3), jump back and forth between those of two devices."""
+    jumps, count = 0, len(gyro_rps)
+    for begin in range(0, count - 5, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE + 5)
+        six = np.hstack([gyro_rps[part], specific_force_mps2[part] / GRAVITY_MPS2])
+        ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
+        jumps += int(np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))))
+    return jumps > _JUMPS * (count - 5) > 0
 
 
 def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlation: float) -> None:

@@ -60,6 +60,16 @@ def test_rates_of_a_recording_too_short_for_gravity_to_turn(tmp_path, capsys, ru
     assert "times the camera's" in error and "rad/s" in error
 
 
+@pytest.mark.parametrize(("gyro", "times"), [(2.0, "2 times"), (0.5, "only 1/2 of")])
+def test_a_gyro_read_with_another_range(tmp_path, capsys, runs, gyro, times):
+    """All numbers are half or twice as large: the sensor was set to another full scale."""
+    folder = write_asl(tmp_path / "a", replace(runs["board"], gyro_rps=gyro * runs["board"].gyro_rps))
+    options = ["--target", f"{folder}/target.yaml", "--initial", f"{folder}/initial.yaml"]
+    assert main(["td-icp", str(folder), *options]) == 1
+    error = capsys.readouterr().err
+    assert f"the gyro's rates are {times} the camera's: is its range the one" in error
+
+
 @pytest.mark.parametrize("command", ["calibrate", "observability", "info"])
 @pytest.mark.parametrize("kind", ["board", "free"])
 @pytest.mark.parametrize(("accel", "unit"), [(1.0 / G, "like g: multiply"), (1000.0 / G, "mg (multiply")])

@@ -63,3 +63,28 @@ def test_rows_of_one_sensor_in_turns_are_named(tmp_path, write_asl):
 
     with pytest.raises(RecordingError, match="no row holds both gyro and accelerometer"):
         rewritten(write_asl(tmp_path / "a"), change)
+
+
+def test_stamps_in_seconds_may_begin_with_a_whole_one(tmp_path, write_asl):
+    """0, 0.005, ...: the first was taken for that of a table of integers, and the second refused."""
+
+    def change(rows):
+        cells = [row.split(",", 1) for row in rows[1:]]
+        begin = int(cells[0][0])
+        return lines([rows[0], *(f"{(int(t) - begin) * 1e-9:.12g},{rest}" for t, rest in cells)])
+
+    before = open_recording(write_asl(tmp_path / "a", corners=False)).imu_arrays("imu0")
+    after = rewritten(write_asl(tmp_path / "b", corners=False), change).imu_arrays("imu0")
+    np.testing.assert_allclose(after.t_ns, before.t_ns - before.t_ns[0], atol=1)
+
+
+def test_two_imus_in_one_table_with_equal_stamps_are_named(tmp_path, write_asl):
+    """The second one's readings were left out as repetitions."""
+
+    def change(rows):
+        cells = [row.split(",") for row in rows[1:]]
+        turned = [",".join([c[0], *c[2:4], c[1], *c[5:7], c[4]]) for c in cells]  # another mounting
+        return lines([rows[0], *(x for pair in zip(rows[1:], turned, strict=True) for x in pair)])
+
+    with pytest.raises(RecordingError, match="as if two IMUs shared one table"):
+        rewritten(write_asl(tmp_path / "a"), change)
