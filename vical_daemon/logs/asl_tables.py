@@ -21,7 +21,8 @@ from vical_daemon.logs.model import RecordingError
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
 _MISSING = frozenset({b"", b"na", b"n/a", b"null", b"none", b"-"})
-_FIRST_ROWS = 20  # of these one stamp of seconds is not a whole one
+_FIRST_NUMBERS = 20  # of these one stamp in seconds is not a whole one
+_ROWS_LOOKED_AT = 20_000  # twenty images of 1000 points
 _IMU_COLUMNS = 7  # stamp, 3 rates, 3 forces
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
@@ -138,10 +139,14 @@ def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
 
 def _fractional(text: bytes, begin: int, column: int) -> bool:
     """Whether one of the first numbers of a column is written with a point or an exponent (0, 0.005, ...)."""
-    for _, line in islice(_data_lines(text, begin), _FIRST_ROWS):
-        cell = (line.split(b",") + [b""] * column)[column].lower()
+    seen = set[bytes]()  # all points of an image have one stamp
+    for _, line in islice(_data_lines(text, begin), _ROWS_LOOKED_AT):
+        cell = (line.split(b",") + [b""] * column)[column].strip().lower()
         if b"." in cell or b"e" in cell:
             return True
+        seen.add(cell)
+        if len(seen) > _FIRST_NUMBERS:
+            break
     return False
 
 

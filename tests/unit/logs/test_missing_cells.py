@@ -78,6 +78,21 @@ def test_stamps_in_seconds_may_begin_with_a_whole_one(tmp_path, write_asl):
     np.testing.assert_allclose(after.t_ns, before.t_ns - before.t_ns[0], atol=1)
 
 
+def test_points_of_the_first_image_may_be_of_a_whole_second(tmp_path, write_asl):
+    """All rows of the first image have the stamp 0."""
+    folder = write_asl(tmp_path / "a")
+    before = open_recording(folder).points_frames("cam0")
+    table = folder / "mav0/cam0/corners.csv"
+    title, *rows = table.read_text().splitlines()
+    begin = int(rows[0].split(",")[0])
+    moved = [(int(t) - begin, rest) for t, rest in (row.split(",", 1) for row in rows)]
+    table.write_bytes(lines([title, *(f"{t * 1e-9:.12g},{rest}" for t, rest in moved)]))
+    after = open_recording(folder, check=False).points_frames("cam0")
+    for one, other in zip(before, after, strict=True):
+        assert abs(one.t_cam_ns - begin - other.t_cam_ns) <= 1
+        np.testing.assert_array_equal(one.uv_px, other.uv_px)
+
+
 def test_two_imus_in_one_table_with_equal_stamps_are_named(tmp_path, write_asl):
     """The second one's readings were left out as repetitions."""
 
