@@ -23,6 +23,8 @@ _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
 _SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
+_LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
+_STANDS = 0.05  # of the change that the gyro's rates mean
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
 _UNIT = 1e-2  # quaternions written with three digits
 _JUMP = 0.3  # rad/s, or of gravity: no motion does that from one reading to the next and back
@@ -61,7 +63,7 @@ def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[st
     constant = _constant_channels(samples)
     ratio, correlation = gyro_scale(samples, rate_hz)
     _check_accelerometer(name, samples, constant, correlation)
-    if mistake := _gyro_mistake(ratio, correlation):
+    if mistake := _gyro_mistake(ratio, correlation) or _turns_at_rest(samples, rate_hz):
         raise RecordingError(f"{name}: {mistake}")
     return [f"{name}: {constant}"] * bool(constant) + _gaps(name, samples.t_ns, rate_hz)
 
@@ -197,19 +199,40 @@ def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
     0.5 s the specific force is mostly gravity, so scale = <df, -w x f dt> / |w x f dt|^2 is near 1 for
     rad/s (0.5 to 1 on hand-held recordings) and near pi/180 for deg/s.
     """
-    width = max(1, round(_SMOOTHING_S * rate_hz))
-    if len(samples.t_ns) < 6 * width:
+    turns = _turns(samples, rate_hz)
+    if turns is None:
         return 1.0, 0.0
-    force = _moving_average(samples.specific_force_mps2, width)
-    gyro = _moving_average(samples.gyro_rps, width)
-    turned = np.cumsum(-np.cross(gyro, force), axis=0) / rate_hz
-    seen = force[2 * width :] - force[: -2 * width]
-    expected = turned[2 * width :] - turned[: -2 * width]
+    seen, expected = turns
     power = float((expected**2).sum())
     product = float((seen * expected).sum())
     if power <= 0 or not np.isfinite(power):
         return 1.0, 0.0
     return product / power, product / float(np.sqrt(power * (seen**2).sum()) + 1e-300)
+
+
+def _turns(samples: ImuArrays, rate_hz: float) -> tuple[FloatArray, FloatArray] | None:
+    """Return how the specific force changes within 1 s, and how it should by the gyro; None: too short."""
+    width = max(1, round(_SMOOTHING_S * rate_hz))
+    if len(samples.t_ns) < 6 * width:
+        return None
+    force = _moving_average(samples.specific_force_mps2, width)
+    gyro = _moving_average(samples.gyro_rps, width)
+    turned = np.cumsum(-np.cross(gyro, force), axis=0) / rate_hz
+    return force[2 * width :] - force[: -2 * width], turned[2 * width :] - turned[: -2 * width]
+
+
+def _turns_at_rest(samples: ImuArrays, rate_hz: float) -> str:
+    """Say that the gyro reads a lasting rate that gravity in the accelerometer does not show at all."""
+    turns = _turns(samples, rate_hz)
+    if turns is None:
+        return ""
+    seen, expected = (float(np.median(np.linalg.norm(x, axis=1))) for x in turns)
+    if expected < _LARGEST_BIAS_RPS * GRAVITY_MPS2 or seen > _STANDS * expected:
+        return ""
+    return (
+        f"the gyro reads about {expected / GRAVITY_MPS2:.2g} although gravity in the accelerometer does not "
+        "turn; rad/s are expected, it looks like deg/s: multiply by pi/180"
+    )
 
 
 def _moving_average(values: FloatArray, width: int) -> FloatArray:

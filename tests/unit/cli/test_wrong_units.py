@@ -95,3 +95,14 @@ def test_a_replay_warns_of_other_units(tmp_path, capsys, runs, monkeypatch):
     folder = write_asl(tmp_path / "a", replace(runs["board"], gyro_rps=DEG * runs["board"].gyro_rps))
     assert main(["replay", str(folder), "--speed", "0"]) == 0
     assert "deg/s: multiply by pi/180" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("bias", "code"), [(0.9, 1), (0.9 / DEG, 0)], ids=["deg/s", "rad/s"])
+def test_an_imu_at_rest_with_a_usual_bias_in_degrees(tmp_path, capsys, bias, code):
+    """Noise alone does not show its unit; a bias of 0.9 rad/s no gyro has."""
+    rng = np.random.default_rng(4)
+    values = rng.normal(0.0, 1e-3, (20_000, 6)) + np.array([0.0, bias, 0.0, 0.0, 0.0, 9.81])
+    rows = (f"{k * 10_000_000}," + ",".join(f"{x:.6f}" for x in row) for k, row in enumerate(values.tolist()))
+    (tmp_path / "rest.csv").write_text("\n".join(rows) + "\n")
+    assert main(["allan", str(tmp_path / "rest.csv")]) == code
+    assert ("although gravity in the accelerometer does not turn" in capsys.readouterr().err) == (code == 1)
