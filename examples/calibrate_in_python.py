@@ -5,6 +5,11 @@ The samples come from the simulated rig of vical_mocks, so that this runs anywhe
 
 from __future__ import annotations
 
+import os
+
+# before numpy is imported: matrices are small, and threads of BLAS make a run several times slower
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 from vical_mocks.points import simulate
 

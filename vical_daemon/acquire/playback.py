@@ -7,6 +7,7 @@ the same data once more would be counted as new ones, and make sigmas small that
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -31,8 +32,10 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.topics import STATUS
 from vical_daemon.config.model import LOG_SCHEME
-from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
+from vical_daemon.logs import Recording, RecordingError, Stream, open_recording, unfit_imus
 from vical_daemon.logs.channel import stamp_of
+
+_log = logging.getLogger(__name__)
 
 _IMU_KINDS = ("imu",)
 _IMAGE_KINDS = ("image", "compressed")
@@ -237,9 +240,12 @@ def _playback_of(path: Path) -> _Playback:
     with _playbacks_lock:
         if key not in _playbacks:
             try:
-                _playbacks[key] = _Playback(open_recording(key, check=False, as_recorded=True))
+                recording = open_recording(key, check=False, as_recorded=True)
             except RecordingError as error:
                 raise DeviceNotFoundError(str(error)) from None
+            for text in unfit_imus(recording):
+                _log.warning("%s: %s", path, text)
+            _playbacks[key] = _Playback(recording)
         return _playbacks[key]
 
 

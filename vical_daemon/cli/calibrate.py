@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -121,11 +122,8 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
     fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
-    for path in (args.report, args.output):
-        if path and not Path(path).absolute().parent.is_dir():
-            raise CliError(f"{path}: its folder does not exist; make it first", EXIT_USAGE)
-        if path and Path(path).is_dir():
-            raise CliError(f"{path} is a folder: give the name of a file", EXIT_USAGE)
+    for path in filter(None, (args.report, args.output)):
+        _check_output(path)
     files = [Path(path).resolve() for path in args.inputs]
     for i, file in enumerate(files):
         if file in files[:i]:
@@ -164,13 +162,35 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
     return job, accepted
 
 
+def _check_output(path: str) -> None:
+    """Refuse an output that could not be written in the end."""
+    folder = Path(path).absolute().parent
+    if not folder.is_dir():
+        raise CliError(f"{path}: its folder does not exist; make it first", EXIT_USAGE)
+    if Path(path).is_dir():
+        raise CliError(f"{path} is a folder: give the name of a file", EXIT_USAGE)
+    if not os.access(folder, os.W_OK) and not os.access(path, os.W_OK):
+        raise CliError(f"{path} cannot be written: no permission, or a read-only disk", EXIT_USAGE)
+
+
 def write(
     args: argparse.Namespace, result: dict[str, Any], more: Callable[[dict[str, Any]], str] | None = None
 ) -> None:
     """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
     text = json.dumps(finite(result), allow_nan=False)
-    if args.output and result["cameras"]:  # a failure must not replace an earlier result
-        write_output(Path(args.output), text + "\n")
+    try:
+        if args.output and result["cameras"]:  # a failure must not replace an earlier result
+            write_output(Path(args.output), text + "\n")
+    finally:  # a full disk must not cost the result either
+        _print(args, result, text, more)
+
+
+def _print(
+    args: argparse.Namespace,
+    result: dict[str, Any],
+    text: str,
+    more: Callable[[dict[str, Any]], str] | None,
+) -> None:
     if args.json:
         print(text)
         return

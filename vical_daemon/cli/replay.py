@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_config, add_json
+from vical_daemon.cli.options import add_config, add_json, warn
 
 if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus
@@ -62,12 +62,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Publish with the time between stamps that there was; without a router, host the bus meanwhile."""
-    from vical_daemon.logs import open_recording
+    from vical_daemon.logs import open_recording, unfit_imus
     from vical_daemon.offline.replay import replay
 
     if args.speed < 0 or args.wait < 0:
         raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
     recording = open_recording(args.log, topics=args.streams, check=False, as_recorded=True)
+    for text in unfit_imus(recording):
+        warn(text)
     bus = _open_bus(args)
     shows = sys.stderr.isatty() and not args.quiet
 

@@ -101,6 +101,8 @@ def parse(text: str, name: str) -> Document:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "cannot be read"
+        if "'\\t'" in problem:
+            problem = "a tab; indent with spaces"
         raise ConfigError(f"{name}{line}: not valid YAML: {problem}") from None
     if value is None:
         value = {}

@@ -32,6 +32,7 @@ __all__ = [
     "mcap_files",
     "meant",
     "open_recording",
+    "unfit_imus",
 ]
 
 LEFT_OUT = "left out, another is used:"
@@ -119,6 +120,17 @@ def check_recording(
                 f"({other.count})"
             )
     return (*readings, *of_cameras)
+
+
+def unfit_imus(recording: Recording) -> list[str]:
+    """Say which imus `vical calibrate` would not take, one line each."""
+    found = []
+    for name in recording.imus:
+        try:
+            check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
+        except RecordingError as error:
+            found.append(f"not fit for calibration: {error}")
+    return found
 
 
 def _fit(

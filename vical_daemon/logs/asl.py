@@ -26,6 +26,7 @@ from vical_daemon.logs.asl_tables import (
     read_table,
     without_cut_line,
 )
+from vical_daemon.logs.checks import take_turns
 from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.model import (
@@ -39,12 +40,17 @@ from vical_daemon.logs.model import (
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, numbers, set_back_s
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
+from vical_daemon.logs.two_tables import one_table, read_sensor, two_tables
+from vical_daemon.logs.united_imu import forces_at
 from vical_daemon.logs.what_is_there import images_in, what_is_there
 
 RIG = "rig0"
+_UNITED = "imu0"  # name of an IMU of two tables
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
+_MOST_FRESH = 0.8  # share of stamps that come once; below it two devices may share a table
+_BLOCK = 4096  # readings that are turned into messages together
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
@@ -106,6 +112,8 @@ class AslRecording(Recording):
         for name, table in imus.items():
             if names is None or name in names:
                 self._sources.append(self._read_imu(table, name))
+        if not imus and (names is None or _UNITED in names):
+            self._sources.extend(self._imu_of_others(root))
         folders = sorted(path for path in root.glob("cam*") if path.is_dir())
         wanted = [path for path in folders if path.name in cameras] or folders
         for camera in wanted:
@@ -145,9 +153,42 @@ class AslRecording(Recording):
             source = sources[which]
             yield source.stream.key, source.build(i)
 
+    def _imu_of_others(self, root: Path) -> list[_Source]:
+        """Return the IMU of a folder whose tables have other names; []: there is none."""
+        if (table := one_table(root)) is not None:
+            self.warnings.append(f"{_UNITED}: {table.name} is read, whose title names all six axes")
+            return [self._read_imu(table, _UNITED)]
+        pair = two_tables(root)
+        return [] if pair is None else [self._read_two(*pair)]
+
+    def _read_two(self, gyro_path: Path, accel_path: Path) -> _Source:
+        """Make one IMU of the tables of a gyro and an accelerometer."""
+        gyro, accel = read_sensor(gyro_path), read_sensor(accel_path)
+        rows = np.empty(len(gyro.t_ns), _IMU_ROW)
+        rows["t"], rows["values"][:, :3] = gyro.t_ns, gyro.axes
+        rows["values"][:, 3:] = forces_at(gyro.t_ns, accel.t_ns, accel.axes)
+        within = np.flatnonzero(np.isfinite(rows["values"][:, 3]))
+        if not len(within):
+            raise RecordingError(
+                f"{gyro_path} and {accel_path.name} were not recorded at the same time by their stamps"
+            )
+        rows = rows[within[0] : within[-1] + 1]
+        self._note_stamps(_UNITED, float(np.hypot(gyro.sigma_s, accel.sigma_s)), gyro.report)
+        used = f"the gyro of {gyro_path.name}, and the accelerometer of {accel_path.name}"
+        self.warnings.append(f"{_UNITED}: {used} interpolated to its stamps")
+        return self._imu_source(rows, _UNITED, gyro_path)
+
     def _read_imu(self, path: Path, name: str) -> _Source:
         rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+        return self._imu_source(rows, name, path)
+
+    def _imu_source(self, rows: npt.NDArray[Any], name: str, path: Path) -> _Source:
         finite = np.isfinite(rows["values"]).all(axis=1) & rows["values"].any(axis=1)
+        if not finite.any():
+            raise RecordingError(
+                f"{path}: no row holds both gyro and accelerometer; were they read at different times? Write "
+                "each into its own table, gyro.csv and accel.csv"
+            )
         rows = self._even(rows[finite], name)
         if not finite.all():
             text = f"{int((~finite).sum())} samples that are not finite, or all 0, left out"
@@ -156,10 +197,16 @@ class AslRecording(Recording):
         force = np.ascontiguousarray(rows["values"][:, 3:])
         t_ns = np.ascontiguousarray(rows["t"])
         self.imu_tables[name] = ImuArrays(t_ns, gyro, force)
-        stamps, gyro_rows, force_rows = t_ns.tolist(), gyro.tolist(), force.tolist()
+        number, block = -1, list[tuple[int, list[float], list[float]]]()
 
         def build(i: int) -> bytes:
-            return encode_imu(stamps[i], name, gyro_rows[i], force_rows[i])
+            nonlocal number, block
+            if i // _BLOCK != number:  # all rows as Python's numbers would take ten times the arrays
+                number = i // _BLOCK
+                part = slice(number * _BLOCK, (number + 1) * _BLOCK)
+                block = list(zip(t_ns[part].tolist(), gyro[part].tolist(), force[part].tolist(), strict=True))
+            stamp_ns, rates, forces = block[i % _BLOCK]
+            return encode_imu(stamp_ns, name, rates, forces)
 
         return _Source(self._stream("imu", name, path, t_ns), t_ns, build)
 
@@ -312,6 +359,12 @@ class AslRecording(Recording):
             rows = rows[np.argsort(rows["t"], kind="stable")]
         if drop_equal and len(rows):
             fresh = np.append(True, np.diff(rows["t"]) > 0)
+            many = fresh.mean() < _MOST_FRESH and name not in self.set_back_s
+            if many and take_turns(rows["values"][:, :3], rows["values"][:, 3:]):
+                raise RecordingError(
+                    f"{name}: {int((~fresh).sum())} rows repeat the stamp of another with other readings, "
+                    "as if two IMUs shared one table; give each its own"
+                )
             if not fresh.all():
                 self.warnings.append(f"{name}: {int((~fresh).sum())} samples with a repeated stamp left out")
                 rows = rows[fresh]

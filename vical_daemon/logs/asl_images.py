@@ -21,7 +21,8 @@ _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _STAMP_DIGITS = 13
 """Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 _MOST = 0.9  # share of the names that are stamps; the others do not belong to the recording
-_TIMES = ("times.txt", "timestamps.txt")
+_TIMES = ("times.txt", "timestamps.txt", "*timestamps.txt", "*timestamps.csv")
+"""Also `frame_timestamps.txt` (MARS logger) and `VID_..._timestamps.csv` (OpenCamera Sensors)."""
 _TRIED = 50  # images whose size is looked for: the first may be damaged
 
 
@@ -104,7 +105,7 @@ def images_by_name(folder: Path) -> Images:
 def _times_of(folder: Path, images: list[Path]) -> list[str]:
     """Return the stamps of a file with a line for each image, `[name] stamp ...`; [] if there is none."""
     places = (folder, folder / "data", folder.parent)
-    path = next((p for place in places for p in (place / name for name in _TIMES) if p.is_file()), None)
+    path = next((p for place in places for name in _TIMES for p in sorted(place.glob(name))), None)
     if path is None:
         return []
     rows = [

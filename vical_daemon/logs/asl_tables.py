@@ -8,6 +8,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ from vical_daemon.logs.model import RecordingError
 
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
+_MISSING = frozenset({b"", b"na", b"n/a", b"null", b"none", b"-"})
+_FIRST_NUMBERS = 20  # of these one stamp in seconds is not a whole one
+_ROWS_LOOKED_AT = 20_000  # twenty images of 1000 points
+_IMU_COLUMNS = 7  # stamp, 3 rates, 3 forces
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
 _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
@@ -26,11 +31,12 @@ _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file 
 
 def without_cut_line(text: bytes, columns: int) -> bytes:
     """Return a table without its last line if that is cut off."""
-    kept, newline, last = text.rpartition(b"\n")
-    if not newline or not last.strip() or last.lstrip().startswith(b"#"):
+    end = text.rfind(b"\n") + 1
+    last = text[end:]
+    if not end or not last.strip() or last.lstrip().startswith(b"#"):
         return text
     cells = last.split(b",")
-    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else kept + newline
+    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else text[:end]
 
 
 def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
@@ -47,24 +53,44 @@ def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> n
     if _has_decimal_commas(text, begin):
         raise RecordingError(f"{path}: more columns than its title: write decimal points, not commas")
     try:
-        rows: npt.NDArray[Any] = np.loadtxt(
-            io.BytesIO(text[begin:]),
-            dtype=dtype,
-            delimiter=",",
-            comments="#",
-            ndmin=1,
-            usecols=range(columns_of(dtype)),
-        )
+        rows = _parsed(text[begin:], dtype)
     except (ValueError, OverflowError, UnicodeDecodeError):
-        raise RecordingError(f"{path}: {_first_mistake(text, begin, wanted)}; expected {columns}") from None
+        mistake = _first_mistake(text, begin, wanted)
+        try:
+            rows = _parsed(_missing_as_nan(text[begin:], columns_of(dtype)), dtype)
+        except (ValueError, OverflowError, UnicodeDecodeError):
+            raise RecordingError(f"{path}: {mistake}; expected {columns}") from None
     for name in (wanted.names or ())[1:]:
         if wanted[name].kind == "i" and (rows[name] % 1 != 0).any():
             raise RecordingError(f"{path}: a fraction where integers are needed; expected {columns}")
     return rows
 
 
+def _parsed(text: bytes, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    rows: npt.NDArray[Any] = np.loadtxt(
+        io.BytesIO(text),
+        dtype=dtype,
+        delimiter=",",
+        comments="#",
+        ndmin=1,
+        usecols=range(columns_of(dtype)),
+    )
+    return rows
+
+
+def _missing_as_nan(text: bytes, count: int) -> bytes:
+    """Return a table with nan in cells that are empty, or written as missing, behind the first column."""
+    lines = text.split(b"\n")
+    for i, line in enumerate(lines):
+        cells = [cell.strip() for cell in line.split(b",")]
+        if len(cells) >= count and any(cell.lower() in _MISSING for cell in cells[1:count]):
+            cells[1:] = [b"nan" if cell.lower() in _MISSING else cell for cell in cells[1:]]
+            lines[i] = b",".join(cells)
+    return b"\n".join(lines)
+
+
 def _type_read(dtype: np.dtype[Any], name: str, text: bytes, begin: int) -> np.dtype[Any]:
-    """Type as which a column is read: that wanted, unless its first number is a fraction."""
+    """Type as which a column is read: that wanted, unless one of its first numbers is a fraction."""
     column = (dtype.names or ()).index(name)
     if dtype[name].kind != "i" or not _fractional(text, begin, column):
         return dtype[name]
@@ -84,6 +110,8 @@ def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
         found = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in found)
         other = next((name for mark, name in _SEPARATORS.items() if line.count(mark) >= count - 1), "")
         hint = f", separated by {other}; separate them by commas, with points in the numbers" if other else ""
+        if not hint and 4 <= len(cells) < count and count == _IMU_COLUMNS:
+            hint = " (gyro and accelerometer in two tables? give the folder that holds both)"
         return f"line {number} is not {count} numbers{hint}: {found!r}"
     return "a stamp or an id is no integer, or too large"
 
@@ -91,8 +119,8 @@ def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
 def _has_decimal_commas(text: bytes, begin: int) -> bool:
     """Whether the first row has more cells than the title, and no point: 0.35 would be read as 0 and 35."""
     _, row = next(_data_lines(text, begin))
-    title = text[: begin or text.find(b"\n")]
-    named = begin > 0 or title.startswith((b"#", b"\xef\xbb\xbf#"))
+    title = text[: text.find(b"\n")]
+    named = begin > 0 or title.startswith(b"#")
     return (
         named
         and title.count(b",") > 1
@@ -110,10 +138,16 @@ def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _fractional(text: bytes, begin: int, column: int) -> bool:
-    """Whether the first number of a column is written with a point or an exponent."""
-    _, first = next(_data_lines(text, begin), (0, b""))
-    cell = (first.split(b",") + [b""] * column)[column].lower()
-    return b"." in cell or b"e" in cell
+    """Whether one of the first numbers of a column is written with a point or an exponent (0, 0.005, ...)."""
+    seen = set[bytes]()  # all points of an image have one stamp
+    for _, line in islice(_data_lines(text, begin), _ROWS_LOOKED_AT):
+        cell = (line.split(b",") + [b""] * column)[column].strip().lower()
+        if b"." in cell or b"e" in cell:
+            return True
+        seen.add(cell)
+        if len(seen) > _FIRST_NUMBERS:
+            break
+    return False
 
 
 def columns_of(dtype: np.dtype[Any]) -> int:
@@ -136,6 +170,9 @@ def read_table(path: Path) -> bytes:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
     if not text or text.isspace():
         raise RecordingError(f"{path} is empty")
+    text = text.removeprefix(b"\xef\xbb\xbf")
+    if b"\n" not in text:
+        text = text.replace(b"\r", b"\n")  # lines as old programs on a Macintosh end them
     return text.replace(b'"', b"")  # some programs put every cell between quotes
 
 
@@ -157,12 +194,16 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _first_data_row(text: bytes) -> int:
-    """Return the offset behind a title line without ``#``."""
-    end = text.find(b"\n")
-    first = text[: end if end >= 0 else len(text)].strip()
-    if first and not first.startswith(b"#") and not first[:1].isdigit() and first[:1] not in b"-+":
-        return end + 1 if end >= 0 else 0
-    return 0
+    """Return the offset behind a title line without ``#``, and behind units in the line below it."""
+    begin = 0
+    for _ in range(2):
+        end = text.find(b"\n", begin)
+        line = text[begin : end if end >= 0 else len(text)].strip()
+        numbers = begin and any(_NUMBER_BYTES.fullmatch(cell.strip()) for cell in line.split(b","))
+        if not line or line[:1].isdigit() or line[:1] in b"-+#" or numbers:
+            break
+        begin = end + 1 if end >= 0 else begin
+    return begin
 
 
 def imu_tables(root: Path) -> dict[str, Path]:

@@ -258,6 +258,11 @@ def with_force(payload: bytes, force: bytes) -> bytes:
     return payload[: _FORCE.start] + force + payload[_FORCE.stop :]
 
 
+def negative(force: bytes) -> bytes:
+    """Return a specific force, see `force_of`, of the opposite sign."""
+    return (-np.frombuffer(force, "<f8")).tobytes()
+
+
 def _is_zero(payload: bytes) -> bool:
     """Whether all six readings are 0: a device that did not answer, or a sender of orientations alone."""
     return payload[_GYRO] == _ZEROS == payload[_FORCE]

@@ -22,6 +22,9 @@ measured turns with the gyro."""
 _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
+_SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
+_LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
+_STANDS = 0.05  # of the change that the gyro's rates mean
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
 _UNIT = 1e-2  # quaternions written with three digits
 _JUMP = 0.3  # rad/s, or of gravity: no motion does that from one reading to the next and back
@@ -31,6 +34,7 @@ _NEARER = 5.0
 _JUMPS = 0.2
 """Share of such jumps from which on two devices take turns; 0.3 if one is four times as fast, none on real
 recordings of one."""
+_AT_ONCE = 100_000  # readings that are looked at together: memory
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 _COPY = "is one of the files a copy of another?"
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
@@ -59,7 +63,8 @@ def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[st
     constant = _constant_channels(samples)
     ratio, correlation = gyro_scale(samples, rate_hz)
     _check_accelerometer(name, samples, constant, correlation)
-    _check_gyro(name, ratio, correlation)
+    if mistake := _gyro_mistake(ratio, correlation) or _turns_at_rest(samples, rate_hz):
+        raise RecordingError(f"{name}: {mistake}")
     return [f"{name}: {constant}"] * bool(constant) + _gaps(name, samples.t_ns, rate_hz)
 
 
@@ -89,14 +94,22 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
 
 def _check_one_device(name: str, samples: ImuArrays) -> None:
     """Refuse the readings of two devices that are mounted differently, in one stream."""
-    six = np.hstack([samples.gyro_rps, samples.specific_force_mps2 / GRAVITY_MPS2])
-    ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
-    jumps = (ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))
-    if jumps.mean() > _JUMPS:
+    if take_turns(samples.gyro_rps, samples.specific_force_mps2):
         raise RecordingError(
             f"{name}: its readings jump back and forth between two sets, as if two IMUs shared one topic "
             "or file (record each on its own topic, or give each its own frame_id), or its clock was set back"
         )
+
+
+def take_turns(gyro_rps: FloatArray, specific_force_mps2: FloatArray) -> bool:
+    """Whether readings, shapes (n, 3), jump back and forth between those of two devices."""
+    jumps, count = 0, len(gyro_rps)
+    for begin in range(0, count - 5, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE + 5)
+        six = np.hstack([gyro_rps[part], specific_force_mps2[part] / GRAVITY_MPS2])
+        ahead = np.stack([np.linalg.norm(six[k : len(six) - 5 + k] - six[:-5], axis=1) for k in range(1, 6)])
+        jumps += int(np.count_nonzero((ahead[0] > _JUMP) & (ahead[0] > _NEARER * ahead[1:].min(axis=0))))
+    return jumps > _JUMPS * (count - 5) > 0
 
 
 def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlation: float) -> None:
@@ -113,7 +126,7 @@ def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlati
     first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
     if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
         text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
-    elif _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
+    elif (_LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro) or _swapped(samples, correlation):
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
     elif constant:
         text = constant
@@ -126,13 +139,20 @@ def _check_accelerometer(name: str, samples: ImuArrays, constant: str, correlati
     elif 0.6 < median < 1.6:
         text = f"it looks like g: multiply by {GRAVITY_MPS2}"
     elif 600 < median < 1600:
-        text = f"it looks like mg: multiply by {GRAVITY_MPS2 / 1000}"
+        text = f"it looks like mg (multiply by {GRAVITY_MPS2 / 1000}) or cm/s^2 (by 0.01)"
     else:
         text = "check its unit"
     raise RecordingError(
         f"{name}: the accelerometer reads {median:.3g} in the middle, m/s^2 (about {GRAVITY_MPS2:.1f}) are "
         f"expected; {text}"
     )
+
+
+def _swapped(samples: ImuArrays, correlation: float) -> bool:
+    """Whether what is read as rates turns with what is read as forces, and not the other way round."""
+    other = ImuArrays(samples.t_ns, samples.specific_force_mps2, samples.gyro_rps)
+    rate_hz = 1e9 / float(np.median(np.diff(samples.t_ns)))
+    return correlation < _TURNS_WITH_GYRO and gyro_scale(other, rate_hz)[1] > _SURELY_TURNS
 
 
 def _constant_channels(samples: ImuArrays) -> str:
@@ -151,17 +171,25 @@ def _constant_channels(samples: ImuArrays) -> str:
     return f"not even noise changes {words}; does the driver read this axis?"
 
 
-def _check_gyro(name: str, ratio: float, correlation: float) -> None:
+def gyro_mistake(samples: ImuArrays) -> str:
+    """Say that the gyro's unit is wrong, by how gravity turns in the accelerometer; empty: nothing shows it.
+
+    Args:
+        samples: In order of their stamps.
+    """
+    if len(samples.t_ns) < 2:
+        return ""
+    step_ns = float(np.median(np.diff(samples.t_ns)))
+    return _gyro_mistake(*gyro_scale(samples, 1e9 / step_ns)) if step_ns > 0 else ""
+
+
+def _gyro_mistake(ratio: float, correlation: float) -> str:
+    shows = "what the turning of gravity in the accelerometer shows; rad/s are expected"
     if correlation > _TURNS_WITH_GYRO and 0.004 < ratio < 0.07:
-        raise RecordingError(
-            f"{name}: the gyro reads {1 / ratio:.0f} times what the turning of gravity in the accelerometer "
-            "shows; rad/s are expected, it looks like deg/s: multiply by pi/180"
-        )
+        return f"the gyro reads {1 / ratio:.0f} times {shows}, it looks like deg/s: multiply by pi/180"
     if correlation > _TURNS_WITH_GYRO and ratio > 15:
-        raise RecordingError(
-            f"{name}: the gyro reads only 1/{ratio:.0f} of what the turning of gravity in the accelerometer "
-            "shows; rad/s are expected, check its unit"
-        )
+        return f"the gyro reads only 1/{ratio:.0f} of {shows}, check its unit"
+    return ""
 
 
 def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
@@ -171,19 +199,40 @@ def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
     0.5 s the specific force is mostly gravity, so scale = <df, -w x f dt> / |w x f dt|^2 is near 1 for
     rad/s (0.5 to 1 on hand-held recordings) and near pi/180 for deg/s.
     """
-    width = max(1, round(_SMOOTHING_S * rate_hz))
-    if len(samples.t_ns) < 6 * width:
+    turns = _turns(samples, rate_hz)
+    if turns is None:
         return 1.0, 0.0
-    force = _moving_average(samples.specific_force_mps2, width)
-    gyro = _moving_average(samples.gyro_rps, width)
-    turned = np.cumsum(-np.cross(gyro, force), axis=0) / rate_hz
-    seen = force[2 * width :] - force[: -2 * width]
-    expected = turned[2 * width :] - turned[: -2 * width]
+    seen, expected = turns
     power = float((expected**2).sum())
     product = float((seen * expected).sum())
     if power <= 0 or not np.isfinite(power):
         return 1.0, 0.0
     return product / power, product / float(np.sqrt(power * (seen**2).sum()) + 1e-300)
+
+
+def _turns(samples: ImuArrays, rate_hz: float) -> tuple[FloatArray, FloatArray] | None:
+    """Return how the specific force changes within 1 s, and how it should by the gyro; None: too short."""
+    width = max(1, round(_SMOOTHING_S * rate_hz))
+    if len(samples.t_ns) < 6 * width:
+        return None
+    force = _moving_average(samples.specific_force_mps2, width)
+    gyro = _moving_average(samples.gyro_rps, width)
+    turned = np.cumsum(-np.cross(gyro, force), axis=0) / rate_hz
+    return force[2 * width :] - force[: -2 * width], turned[2 * width :] - turned[: -2 * width]
+
+
+def _turns_at_rest(samples: ImuArrays, rate_hz: float) -> str:
+    """Say that the gyro reads a lasting rate that gravity in the accelerometer does not show at all."""
+    turns = _turns(samples, rate_hz)
+    if turns is None:
+        return ""
+    seen, expected = (float(np.median(np.linalg.norm(x, axis=1))) for x in turns)
+    if expected < _LARGEST_BIAS_RPS * GRAVITY_MPS2 or seen > _STANDS * expected:
+        return ""
+    return (
+        f"the gyro reads about {expected / GRAVITY_MPS2:.2g} although gravity in the accelerometer does not "
+        "turn; rad/s are expected, it looks like deg/s: multiply by pi/180"
+    )
 
 
 def _moving_average(values: FloatArray, width: int) -> FloatArray:

@@ -65,6 +65,7 @@ _PLAIN_WORDS = {
     "camera_info",
     "imu",
 }
+_HOLES = 0.01  # share of an image: the edges of what a stereo camera sees are more than that
 _RIG = "rig0"
 _UNDATED = (
     "its messages have no stamps (header.stamp is 0); the times at which they were recorded are used, so the "
@@ -135,6 +136,7 @@ class LogRecording(Recording):
         self._statuses: dict[str, str] = {}  # key of each topic with our status messages
         self._undated: set[str] = set()  # topics whose messages are dated by their log times
         self._split: set[str] = set()  # topics on which several devices publish in turns
+        self._holes: set[str] = set()  # topics that may show depth by their first image, see `_has_holes`
         self._order = OutOfReach()
         self._scan()
         self._scanned = True
@@ -178,6 +180,7 @@ class LogRecording(Recording):
                 text = f"{channel.name}: {channel.unreadable} unreadable messages left out{why}"
                 self.warnings.append(text)
         self._tell_devices_apart()
+        self._leave_depth_out()
         for channel in self._channels.values():
             channel.leave_out_strays()
             if back_s := set_back_s(channel.t_ns()):
@@ -191,6 +194,16 @@ class LogRecording(Recording):
                     f"{channel.name}: {sum(n for _, n in others)} images are not {size[0]} x {size[1]} as "
                     f"{most} are, and are not used"
                 )
+
+    def _leave_depth_out(self) -> None:
+        """Leave out images that may show depth, if there are others."""
+        cameras = [topic for topic, channel in self._channels.items() if channel.kind != "imu"]
+        if self._holes.issuperset(cameras):
+            return
+        for topic in self._holes.intersection(cameras):
+            del self._channels[topic]
+            self._others[topic] = IMAGE_TYPE
+            self.warnings.append(f"{topic}: images of depth, left out")
 
     def _tell_devices_apart(self) -> None:
         """Make one imu of each frame_id on a topic on which several publish in turns."""
@@ -249,6 +262,8 @@ class LogRecording(Recording):
         if parsed is not None:
             self._belongs_to(parsed.rig, kind, name)
         channel = self._channels[raw.topic] = Channel(key, kind, name)
+        if kind == "image" and _has_holes(raw):
+            self._holes.add(raw.topic)
         return channel
 
     def _belongs_to(self, rig: str, kind: Kind, name: str) -> None:
@@ -391,7 +406,7 @@ def _with_frame(topic: str, frame: bytes) -> str:
 
 
 def _shows_depth(raw: RawMessage) -> bool:
-    """Whether an image holds distances: `compressedDepth`, or 16 bit or 32FC1 (REP 118) on such a topic.
+    """Whether an image holds distances: `compressedDepth`, 32FC1 (REP 118), or 16 bit on such a topic.
 
     Thermal cameras send 16UC1, too. (mono16: bags of the RealSense viewer.)
     """
@@ -401,7 +416,19 @@ def _shows_depth(raw: RawMessage) -> bool:
         encoding = decode_image(raw.payload).encoding
     except MessageError:
         return False
-    return encoding in ("16UC1", "mono16", "32FC1") and "depth" in raw.topic.lower()
+    return encoding == "32FC1" or (encoding in ("16UC1", "mono16") and "depth" in raw.topic.lower())
+
+
+def _has_holes(raw: RawMessage) -> bool:
+    """Whether an image may hold distances in millimetres (16UC1): where there is none it is 0 (REP 118).
+
+    No pixel of a thermal camera is.
+    """
+    try:
+        image = decode_image(raw.payload)
+        return image.encoding == "16UC1" and float(np.mean(image.pixels() == 0)) > _HOLES
+    except MessageError:
+        return False
 
 
 class McapRecording(LogRecording):

@@ -11,7 +11,7 @@ _IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|ang\w*acc")
 _GYRO = re.compile(r"gyr|omega|ang\w*\W?(vel|rate|speed)|rot\w*\W?(vel|rate|speed)|^[wg]_?(rs_s)?_?[xyz]$")
 _ACCEL = re.compile(r"acc|specific|force|^a_?(rs_s)?_?[xyz]$|^f_?[xyz]$")
 _DEGREES = re.compile(r"deg|dps|°")
-_STAMP = re.compile(r"time|stamp|^ts?$|^ts_|^t_")
+_STAMP = re.compile(r"time|stamp|^ts?$|^ts_|^t_|^cts$")
 _WHOLE, _REST = re.compile(r"stamp\W?secs?$"), re.compile(r"stamp\W?nsecs?$|stamp\W?nanosecs?$")
 
 
@@ -58,6 +58,33 @@ def columns_by_title(title: str) -> Columns | None:
     return Columns((stamp, *axes), rest)
 
 
+def axes_by_title(title: str) -> Columns | None:
+    """Return stamp and axes of a table of one sensor by its title; None: it does not name them.
+
+    In exports of GoPro's telemetry the sensor's name stands over the first axis, 1 and 2 over the others.
+
+    >>> axes_by_title("time,seconds_elapsed,z,y,x").numbers
+    (0, 4, 3, 2)
+    >>> axes_by_title("cts,date,Accelerometer [m/s2],1,2").numbers
+    (0, 2, 3, 4)
+    """
+    names = [_plain(name) for name in title.split(",")]
+    found = [[i for i, name in enumerate(names) if name.endswith(axis)] for axis in "xyz"]
+    axes = [i[0] for i in found if len(i) == 1]
+    if len(axes) < 3:
+        first = next((i for i, name in enumerate(names) if _GYRO.search(name) or _ACCEL.search(name)), None)
+        if first is None or names[first + 1 : first + 3] != ["1", "2"]:
+            return None
+        axes = [first, first + 1, first + 2]
+    stamp, rest = _stamp_of(names, axes)
+    return Columns((stamp, *axes), rest)
+
+
+def names_degrees(title: str) -> bool:
+    """Whether the title of a table of one sensor names degrees a second."""
+    return re.search(r"deg\w*\W*(/|per|s)|dps|°/s", title.lower()) is not None
+
+
 def degrees_named(title: str) -> bool:
     """Whether the title of a table gives rates in degrees: at rest, the readings do not show it.
 
@@ -86,7 +113,7 @@ def reordered(text: bytes, columns: Columns) -> bytes:
 
 def _plain(name: str) -> str:
     """Return a column's name in lower case, without its unit and what `rostopic echo -p` puts before it."""
-    name = re.sub(r"[\[(].*", "", name.lower()).strip(' #%\t\r"\ufeff')
+    name = re.sub(r"[\[(].*", "", name.lower()).strip(' #%\t\r\n"\ufeff')
     return name.removeprefix("field.")
 
 

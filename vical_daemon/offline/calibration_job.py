@@ -12,7 +12,7 @@ from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, I
 from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream, meant
-from vical_daemon.logs.channel import stamp_of
+from vical_daemon.logs.channel import force_of, negative, stamp_of, with_force
 from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.camera_names import priors_meant
 from vical_daemon.offline.errors import InputError, OptionError, size_unknown
@@ -35,6 +35,7 @@ class Job:
         others: Further recordings of the same rig, in the order in which they are used.
         common_clock: The time shift is the same in all recordings.
         accel_late: By how many readings the accelerometer is behind the gyro, see `AccelShift`.
+        negate_force: Use the accelerometer with the opposite sign, to find out whether that is the mistake.
     """
 
     recording: Recording
@@ -47,6 +48,7 @@ class Job:
     others: list[Job] = field(default_factory=list)
     common_clock: bool = True
     accel_late: int = 0
+    negate_force: bool = False
 
     @property
     def duration_s(self) -> float:
@@ -80,7 +82,8 @@ class Job:
                 continue
             complete = shift.take(payload) if key == self.imu.key else payload
             if complete is not None:
-                yield key, complete
+                negated = self.negate_force and key == self.imu.key
+                yield key, with_force(complete, negative(force_of(complete))) if negated else complete
 
 
 def make_job(

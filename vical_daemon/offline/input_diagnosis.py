@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,21 @@ from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.logs import Stream
+from vical_daemon.offline.calibrate import run_job
 from vical_daemon.offline.calibration_job import Job
 from vical_daemon.offline.errors import InputError
+from vical_daemon.offline.td_icp.gyro_unit import with_unit_named
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
 _LOOKS = 40  # images that are looked at for another board; each takes 0.1 to 0.2 s
 _CERTAIN = 5.0  # sigmas
 _MOUNTED_RAD, _SHIFTED_S = 0.03, 2e-3
 """What a start corrects or tolerates beside them: about 2 deg, 2 ms."""
+_NEGATED = (
+    "the accelerometer reports gravity instead of specific force (with its opposite sign there is a "
+    "calibration): negate all three of its axes"
+)
+_TRIED_S = 30.0  # of a recording, with the opposite sign; a start needs some ten seconds
 _LEAST_HZ = 5.0
 """Images a second without a target, as TD-ICP needs them; with a moving hand 4 started, 3 did not."""
 
@@ -31,7 +39,7 @@ def diagnose_input(job: Job) -> str:
     Rotations first (a mirrored gyro, stamps at different rates), then the accelerometer's signs and axes.
     """
     if job.config.target is None:
-        return _too_few_images(job)
+        return _too_few_images(job) or _negated(job)
     from vical_daemon.vision.target import AprilGrid, load_target
 
     target = load_target(Path(job.config.target))
@@ -48,6 +56,7 @@ def diagnose_input(job: Job) -> str:
             return str(error)
         t_cam_s = seconds(poses.t_cam_ns, int(imu.t_ns[0]))
         found = td_icp(t_imu_s, imu.gyro_rps, t_cam_s, poses.R_world_cam, poses.covariance)
+        found = with_unit_named(found, imu, t_cam_s, poses.R_world_cam)
         if found.status == REFUSED:
             return f"{name}: {found.reason}"
         if held := _wrong_held_value(job, prior, found):
@@ -76,6 +85,14 @@ def _too_few_images(job: Job) -> str:
                 "show a target and give --target"
             )
     return ""
+
+
+def _negated(job: Job) -> str:
+    """Say that only the negated accelerometer gives a calibration; a part of the data shows it."""
+    part_s = min(job.duration_s, _TRIED_S)
+    tried = replace(job, seconds=part_s, others=[], negate_force=True)
+    estimate = run_job(tried, lambda *_: None, enough=lambda found: bool(found.cameras)).estimate
+    return f"{job.imu.name}: {_NEGATED}" if estimate.cameras else ""
 
 
 def _another_board(job: Job, name: str, stream: Stream) -> str:

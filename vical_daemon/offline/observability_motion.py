@@ -16,9 +16,11 @@ from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.tools.observability import Motion, Setup
-from vical_daemon.logs import meant, open_recording
+from vical_daemon.logs import ImuArrays, Recording, meant, open_recording
+from vical_daemon.logs.checks import check_imu
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 from vical_daemon.offline.observability_tracks import MAX_FRAMES, MAX_SECONDS, motion_without_board
+from vical_daemon.offline.td_icp.gyro_unit import with_unit_named
 from vical_daemon.offline.td_icp.request import choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
@@ -61,20 +63,21 @@ def motion_of(
             f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}"
         )
     stream, prior = cameras[name], prior_of(initial, name)
+    readings = _readings(recording, imu)
     if target is None and stream.kind != "points":
         return motion_without_board(recording, initial, name, imu, blocks)
     if stream.kind == "tracks":
         raise InputError(f"{name} holds tracks of unknown points: leave out --target")
     lens = lens_of(stream, prior)
     poses, fit = board_poses(recording, stream, lens, target, warn)
-    chosen, t_ns, gyro = choose_gyro(recording, imu)
-    force = recording.imu_arrays(chosen).specific_force_mps2
-    base = int(t_ns[0])
-    t_imu, t_cam = seconds(t_ns, base), seconds(poses.t_cam_ns, base)
+    gyro, force = readings.gyro_rps, readings.specific_force_mps2
+    base = int(readings.t_ns[0])
+    t_imu, t_cam = seconds(readings.t_ns, base), seconds(poses.t_cam_ns, base)
     fresh = np.concatenate(([True], np.diff(t_imu) > 1e-6))
     t_imu, gyro, force = t_imu[fresh], gyro[fresh], force[fresh]
     result = td_icp(t_imu, gyro, t_cam, poses.R_world_cam, poses.covariance, TdIcpOptions())
     if result.status == REFUSED:
+        result = with_unit_named(result, readings, t_cam, poses.R_world_cam)
         result = _without_motion(poses, result)
     p_imu_cam = np.zeros(3)
     if prior is not None and prior.T_imu_cam is not None:
@@ -85,6 +88,14 @@ def motion_of(
     assert target is not None  # or there were no poses
     corner_px = 0.5 if fit is None else fit.corner_sigma_px
     return motion, _setup(lens, corner_px, result, p_imu_cam, blocks, target), frames
+
+
+def _readings(recording: Recording, imu: str | None) -> ImuArrays:
+    """Return the readings of the imu that is meant, whose units and rate are plausible."""
+    name, _, _ = choose_gyro(recording, imu)
+    readings = recording.imu_arrays(name)
+    check_imu(name, readings, recording.set_back_s.get(name, 0.0))
+    return readings
 
 
 def _without_motion(poses: Orientations, result: TdIcpResult) -> TdIcpResult:

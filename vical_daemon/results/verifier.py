@@ -92,7 +92,9 @@ class Verifier:
             return
         check.odds, check.why = weighed, ""
         sure = weighed.log_changed > math.log(len(self.cameras) / FALSE_ALARM)
-        if sure and (weighed.undecided or _another_lens(check.stored, weighed, self.counts)):
+        # a change that is certain, but of blocks that are known to have changed by less than counts, is none
+        may_count = set(weighed.blocks) & set(weighed.undecided)
+        if sure and (may_count or _another_lens(check.stored, weighed, self.counts)):
             check.answer = Answer.CHANGED
         elif not weighed.undecided:
             check.answer = Answer.HOLDS

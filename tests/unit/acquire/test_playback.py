@@ -53,6 +53,20 @@ def _samples(imu: ImuSource, count: int) -> list:
     return samples
 
 
+def test_a_recording_in_other_units_is_named_when_it_is_opened(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "g.mcap"
+    with LogWriter(path) as writer:
+        for k in range(IMU_COUNT):
+            t_ns = T0_NS + k * IMU_STEP_NS
+            small = 1e-4 * k
+            payload = encode_imu(t_ns, "imu0", (small, small, small), (small, small, 1.0 + small))
+            writer.write("vical/rig0/imu/imu0", payload, t_ns)
+    with open_imu(ImuConfig(port=f"log:{path}")):
+        pass
+    assert "not fit for calibration: imu0: the accelerometer reads 1 in the middle" in caplog.text
+    assert "it looks like g" in caplog.text
+
+
 def test_imu_and_camera_share_the_recorded_time_base(log: Path) -> None:
     before_ns = time.monotonic_ns()
     with (

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
+from vical_mocks.harness.asl import write_asl
+from vical_mocks.points import simulate
 
 from vical_daemon.cli import main
 
@@ -49,3 +53,26 @@ def test_an_output_onto_an_input_is_bad_usage(words, files, capsys) -> None:
     line = capsys.readouterr().err
     assert ("is read by this command" in line or "two outputs" in line) and line.count("\n") == 1
     assert all(path.read_text() == TARGET for path in files.values())
+
+
+def test_a_full_disk_does_not_cost_the_result(tmp_path, monkeypatch, capsys) -> None:
+    """It is printed although the file cannot be written."""
+
+    def full(path: Path, _: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr("vical_daemon.cli.calibrate.write_output", full)
+    folder = write_asl(tmp_path / "a", simulate(3, 8.0))
+    options = ["--target", f"{folder}/target.yaml", "--initial", f"{folder}/initial.yaml"]
+    assert main(["calibrate", str(folder), *options, "-o", f"{tmp_path}/r.json"]) == 1
+    out = capsys.readouterr()
+    assert "time shift" in out.out
+    assert out.err.splitlines()[-1] == f"vical: error: {tmp_path}/r.json: No space left on device"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_refused_before_the_work(files, capsys) -> None:
+    folder = files["log.mcap"].parent / "locked"
+    folder.mkdir(mode=0o555)
+    assert main(["calibrate", "log.mcap", "-o", "locked/r.json"]) == 2
+    assert "locked/r.json cannot be written" in capsys.readouterr().err

@@ -144,6 +144,7 @@ def test_scientific_notation_is_the_number_it_means() -> None:
         ('a: "x\\0y"', "a: a zero byte"),
         ("- 1\n- 2", "expected `key: value` lines"),
         ("a: [1", "not valid YAML"),
+        ("a:\n\tb: 1", "not valid YAML: a tab; indent with spaces"),
         ("a: !!python/object/apply:os.system [true]", "expected"),
         ("a: !!python/name:os.system x", "tag"),
         ("[" * 5000, "nested too deeply"),

@@ -47,10 +47,20 @@ def levels(recording):
         (lambda i, t: f"{i}", ("mav0/cam0/times.txt", lambda i, t: f"{t // 10**9}.{t % 10**9:09d}")),
         (lambda i, t: f"{i:06d}", ("mav0/cam0/data/times.txt", lambda i, t: f"{i:06d} {t * 1e-9:.9f} 0.01")),
         (lambda i, t: f"frame{i}", ("mav0/timestamps.txt", lambda i, t: f"{t}")),
+        (lambda i, t: f"{i}", ("mav0/VID_20260101_timestamps.csv", lambda i, t: f"{t}")),
+        (lambda i, t: f"{i}", ("mav0/cam0/frame_timestamps.txt", lambda i, t: f"{t}")),
         (lambda i, t: f"{t}", ("mav0/cam0/data.csv", lambda i, t: f"{t},{t}")),
         (lambda i, t: f"{t}", ("mav0/cam0/data.csv", lambda i, t: f"{t},cam0/data/{t}.png")),
     ],
-    ids=["numbers", "numbers with their stamps", "nanoseconds", "no ending", "folders in the table"],
+    ids=[
+        "numbers",
+        "numbers with their stamps",
+        "ns",
+        "OpenCamera",
+        "MARS",
+        "no ending",
+        "folders in the table",
+    ],
 )
 def test_images_get_their_stamps(write, name, table):
     folder, stamps = write(name, table)

@@ -469,6 +469,26 @@ def test_stamps_of_whole_seconds_are_named(tmp_path, write_asl):
         open_recording(tmp_path / "a.mcap")
 
 
+@pytest.mark.parametrize("colour", [True, False])
+def test_images_of_depth_are_known_by_their_holes(tmp_path, a_motion, colour):
+    """Named after its sensor only; alone in a log it is taken as a camera."""
+    t_ns, gyro, force = a_motion(seconds=3.0)
+    gray, depth = np.zeros((60, 80), np.uint8), np.full((60, 80), 700, np.uint16)
+    depth[:, :3] = 0
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for t, w, f in zip(t_ns.tolist(), gyro.tolist(), force.tolist(), strict=True):
+            writer.write("vical/rig0/imu/imu0", encode_imu(t, "imu0", w, f), t)
+        for t in t_ns[::10].tolist():
+            writer.write("vical/rig0/camera/tof/image", encode_image(t, "tof", depth, "16UC1"), t)
+            if colour:
+                writer.write("vical/rig0/camera/left/image", encode_image(t, "left", gray, "mono8"), t)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert list(recording.cameras) == ["left" if colour else "tof"]
+    assert [w for w in recording.warnings if "depth" in w] == [
+        "/vical/rig0/camera/tof/image: images of depth, left out"
+    ] * colour
+
+
 def test_images_of_depth_are_no_camera(tmp_path, a_motion):
     """A RealSense or a ZED: no board is ever seen in them."""
     t_ns, gyro, force = a_motion(seconds=3.0)

@@ -105,6 +105,20 @@ def test_a_lens_whose_distortion_alone_is_wrong_is_another_lens(stored, k1, verd
     assert document["cameras"]["cam0"]["blocks"]["lens"]["holds"] == (verdict == "holds")
 
 
+def test_a_certain_change_below_what_counts_is_none_while_another_block_is_undecided(stored):
+    """Stamps that settle in the first seconds: the time shift of a demo was 0.28 ms apart, 6 sigma."""
+    e, times = np.zeros(15), np.ones(15)
+    e[6] = 4.5e-4
+    times[:3] = 8.0  # what counts of the position is not yet visible
+    check = CameraCheck(replace(stored, model_fits=True), lens_asked=True)
+    assert not Verifier({"cam0": check}).look(estimate(e, covariance=np.diag((times * SIGMA) ** 2)))
+    assert check.answer is Answer.CANNOT_TELL
+    assert check.odds is not None
+    assert check.odds.blocks == ("time shift",)
+    assert check.odds.log_changed > np.log(1000.0)
+    assert check.odds.undecided == ["position"]
+
+
 def test_poor_motion_cannot_tell_and_names_what_is_missing(stored):
     verifier = Verifier({"cam0": CameraCheck(stored, lens_asked=True)})
     assert not verifier.look(estimate(times=40.0))

@@ -13,6 +13,7 @@ from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
 from vical_daemon.estimation.temporal.track_registration import track_registration
 from vical_daemon.logs import Recording, meant
 from vical_daemon.offline.errors import InputError, OptionError
+from vical_daemon.offline.td_icp.gyro_unit import with_unit_named
 from vical_daemon.offline.td_icp.request import TdIcpRequest, choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import LensUsed, camera_stream, seconds, track_frames
 
@@ -59,10 +60,14 @@ def register_camera(request: TdIcpRequest, watch_s: float | None = None) -> Sing
         result = track_registration(t_imu, gyro, frames, lens, options)
         if watch_s is not None:
             raise OptionError("--watch needs a board: tracks of unknown points are fitted as a whole")
+        if result.status == REFUSED:
+            result = with_unit_named(result, recording.imu_arrays(imu))
         return SingleResult(imu, camera, result, used)
     found, used = camera_stream(recording, stream, prior, request.target, base, request.warn)
     poses = found.t_s, found.R_world_sensor, found.rotation_sigma
     result = td_icp(t_imu, gyro, *poses, options)
+    if result.status == REFUSED:
+        result = with_unit_named(result, recording.imu_arrays(imu), found.t_s, found.R_world_sensor)
     watch = []
     if watch_s is not None and result.status != REFUSED:
         watch = delay_windows(t_imu, gyro, *poses, options, watch_s)

@@ -154,6 +154,8 @@ class IidcCamera(Closing):
     def _describe(self) -> DeviceInfo:
         device, bus = self._need()
         exposure_ns = self._frames.stamper.exposure_ns
+        settable = device.has_absolute(abi.FEATURE_SHUTTER)
+        not_told = "automatic" if settable and device.is_automatic(abi.FEATURE_SHUTTER) else "unknown"
         return DeviceInfo(
             kind="camera",
             model=device.vendor_and_model,
@@ -166,7 +168,7 @@ class IidcCamera(Closing):
                 "size": f"{self._mode.width}x{self._mode.height}",
                 "rate_hz": f"{self._mode.rate_hz:g}",
                 "encoding": self._settings.encoding,
-                "exposure_s": "unknown" if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
+                "exposure_s": not_told if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
                 "embedded_stamp": "yes" if self._frame_info else "no",
             },
         )

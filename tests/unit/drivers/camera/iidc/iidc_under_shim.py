@@ -142,6 +142,21 @@ def test_without_embedding_the_first_packet_dates_the_frame(open_iidc: OpenIidc,
     assert sum(source.read(1.0).dropped_before for _ in range(6)) >= 3
 
 
+def test_an_automatic_exposure_is_called_that(open_iidc: OpenIidc, rig: FireWireRig) -> None:
+    """As `vical init` opens a camera: it then writes an exposure into the config, which ends the guessing."""
+    asked_nothing: dict[str, Any] = {"exposure_s": None}
+    with open_iidc(**asked_nothing) as source:  # the image says which shutter it had
+        assert float(source.info.details["exposure_s"]) > 0.0
+    rig.shared.no_embedding = 1
+    power_cycle(rig)
+    with open_iidc(**asked_nothing) as source:
+        assert source.info.details["exposure_s"] == "automatic"
+        assert source.read(1.0).stamp_rule == "raw-first-packet"
+    with open_iidc() as source:
+        assert source.info.details["exposure_s"] == "0.005"
+        assert source.read(1.0).stamp_rule == "first-packet-exposure/2"
+
+
 def test_losses_are_found_by_the_embedded_counter(open_iidc: OpenIidc, rig: FireWireRig) -> None:
     source = open_iidc(buffers=6)
     frames = [source.read(1.0)]
