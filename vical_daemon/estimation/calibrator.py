@@ -269,9 +269,9 @@ class Calibrator:
         assert f is not None
         lost.take(frame, t_cam_s, f.state, self._buffer)
         if frame.camera in self._seek_shift:
-            if len(lost.frames) < MIN_ORIENTATIONS:
-                return []
             lost = self._seek(f, lost, frame.camera)
+        if not self._seek_shift.isdisjoint(kept.camera for _, kept in lost.frames):
+            return []
         self._trim(lost.frames[0][0] if lost.frames else t_cam_s)
         motion = lost.motion(f, self._buffer)
         if motion is None:
@@ -421,12 +421,20 @@ class Calibrator:
         self._initializer = self._new_initializer(sound.off if sound else ())
 
     def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
-        """After the clock of a camera was set: find its time shift from the images collected."""
+        """Find the time shift of a camera from the images collected, once they suffice.
+
+        After its clock was set, or in another recording.
+        """
+        if isinstance(lost, RecordingStart):
+            fit = lost.shift(f.state, self._buffer, camera)
+            if fit is None and not lost.given_up:
+                return lost
+        else:
+            own = [x for x in lost.frames if x[1].camera == camera]
+            if len(lost.frames) < MIN_ORIENTATIONS:
+                return lost
+            fit = self._past.shift_of(own, f, self._buffer, self.rig.target)
         self._seek_shift.discard(camera)
-        if isinstance(lost, RecordingStart):  # the gyro's bias is that of another recording
-            f.state.gyro_bias = lost.gyro_bias(f.state, self._buffer)
-        own = [x for x in lost.frames if x[1].camera == camera]
-        fit = self._past.shift_of(own, f, self._buffer, self.rig.target)
         if fit is None:
             return lost
         self._set_shift(f, camera, fit)
@@ -468,11 +476,11 @@ class Calibrator:
         self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()
-            self._lost = RecordingStart(self.rig.target, {})
             self._seek_shift |= f.drifting  # who knows how far, in the time between
             if not common_clock:
                 self._seek_shift |= {n for n, c in cameras.items() if c.timeshift is not None}
             self._seek_shift -= f.absent
+            self._lost = RecordingStart(self.rig.target, {}, seeking=bool(self._seek_shift))
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

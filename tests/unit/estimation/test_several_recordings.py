@@ -202,6 +202,21 @@ def test_clocks_that_drift_have_another_time_shift_in_the_next_recording() -> No
     assert camera.T_imu_cam.p_m == pytest.approx(first.rig.p_imu_cam, abs=2e-3)
 
 
+@pytest.mark.parametrize("late_s", [-0.3, 0.05, 0.4])
+def test_another_clock_is_found_while_the_biases_are_not_known_either(after_first, late_s) -> None:
+    """A bias by images that are late is off by up to 1 rad/s: no time shift fitted, the rig was `bumped`."""
+    late = simulate(42, 8.0, rig=replace(another(42), timeshift_cam_imu_s=SHIFT_S + late_s))
+    c = pickle.loads(after_first)
+    before = len(c.estimate().events)
+    c.next_recording(common_clock=False)
+    feed(c, items(late, later_s=16.0 + APART_S))
+    together = c.estimate()
+    assert together.status is Status.CONVERGED
+    error, covariance = error_and_covariance(together, late)
+    assert nees(error, covariance, 7) < chi2.isf(1e-3, 7)
+    assert not {e.kind for e in together.events[before:]} & {EventKind.BUMPED, EventKind.STARTED_ANEW}
+
+
 def test_without_a_target_too() -> None:
     first = simulate_tracks(1, 14.0, rig=reference_rig(1, timeshift_cam_imu_s=SHIFT_S), camera_rate_hz=10.0)
     # the tracks of a room: the world's z is up, and stays so

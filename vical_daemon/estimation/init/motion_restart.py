@@ -20,6 +20,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.attempts import LONG_S, Attempts
 from vical_daemon.estimation.init.linear_start import (
     BIAS,
     GRAVITY,
@@ -29,7 +30,7 @@ from vical_daemon.estimation.init.linear_start import (
     LinearStart,
     linear_start,
 )
-from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
@@ -47,6 +48,9 @@ from vical_daemon.estimation.model.state import (
     State,
 )
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.shift_step import ShiftFit
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE = 0.03
@@ -56,6 +60,10 @@ _WIDE_MPS = 0.3  # of velocity: ten times what a board in full view gives
 _RECORDING_IMAGES = 8  # of another recording, with poses: fewer do not show which of them are wrong
 _RECORDING_S = 1.5
 """Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
+_SHIFT_S = 2.0  # of images from which on a time shift is looked for: two swings of a hand
+_SHIFT_SIGMA_S, _MOUNTED_RAD = 4e-3, float(np.deg2rad(3.0))
+"""A time shift found as well as this is kept (0.2 deg at 60 deg/s), if the mounting found with it is near to
+that which is known: turns over some seconds show it to a degree."""
 _MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now
 _POSITION_SIGMA_M = 2e-3  # of a pose of the target, m: weighs the prior of the bias
 
@@ -276,12 +284,25 @@ class RecordingStart(MotionRestart):
     Gravity and the biases are unknown, too: the board may stand elsewhere, the imu was switched off. With the
     calibration known, all are linear in poses of the target over a second or two; the gyro's bias is by what
     its turns differ from those seen.
+
+    Args:
+        target: Points of the target, m, shape (n, 3).
+        before_ns: See `MotionRestart`.
+        seeking: A time shift is to be found first, see `shift`; images are kept for longer.
+
+    Attributes:
+        given_up: Images do not show the time shift, and no more of them are kept.
     """
+
+    def __init__(self, target: FloatArray, before_ns: Mapping[str, int], *, seeking: bool = False) -> None:
+        super().__init__(target, before_ns)
+        self._longest_s, self._attempts = LONG_S if seeking else _MOST_S, Attempts(first_s=0.5)
+        self.given_up = False
 
     def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
         """See `MotionRestart.take`; images of long ago are left out."""
         super().take(frame, t_cam_s, state, buffer)
-        self.drop_before(t_cam_s - _MOST_S)
+        self.drop_before(t_cam_s - self._longest_s)
 
     def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
         """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
@@ -309,11 +330,35 @@ class RecordingStart(MotionRestart):
             float(poses.t_s[0]), poses.R[0], start.p_world_cam, start.v_world_imu, wide, 0.0, biases
         )
 
-    def gyro_bias(self, state: State, buffer: ImuBuffer) -> FloatArray:
-        """Bias of the gyro by the images so far, rad/s, shape (3,); the state's where they say nothing."""
-        poses = self._enough_poses(state, 3, 0.0)
-        found = None if poses is None else _gyro_bias(buffer, poses.t_s, poses.R)
-        return state.gyro_bias if found is None else found
+    def shift(self, state: State, buffer: ImuBuffer, camera: str) -> ShiftFit | None:
+        """Time shift of a camera whose clock may be off by seconds, by its turns and the gyro's.
+
+        The bias is not known either, and a wrong time shift gives a wrong bias: both are found together.
+
+        Args:
+            state: With the calibration as it is known.
+            buffer: Inertial readings.
+            camera: Its name.
+
+        Returns:
+            None: not known so far.
+        """
+        poses = [s for s in self._seen if s is not None and s.frame.camera == camera]
+        span_s = poses[-1].t_cam_s - poses[0].t_cam_s if poses else 0.0
+        if len(poses) < MIN_ORIENTATIONS or span_s < _SHIFT_S or not self._attempts.due(poses[-1].t_cam_s):
+            return None
+        self._attempts.tried(poses[-1].t_cam_s)
+        known, rows = state.cameras[camera], buffer.rows
+        t_s, R = np.array([p.t_cam_s for p in poses]), np.array([p.R_target_cam for p in poses])
+        found = td_icp(rows[:, 0], rows[:, 1:4], t_s, R, attitude_sigmas(poses, known))
+        if found.still:
+            self.drop_before(float(t_s[-1]))
+            return None
+        off_rad = float(np.linalg.norm(so3.log(found.R_imu_cam.T @ known.R_imu_cam)))
+        if found.status != "ok" or not (off_rad < _MOUNTED_RAD and found.timeshift_sigma_s < _SHIFT_SIGMA_S):
+            self.given_up = span_s > self._longest_s - _SHIFT_S
+            return None
+        return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True)
 
 
 def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> FloatArray | None:
