@@ -276,6 +276,7 @@ class Bundle:
             if not beyond.any():
                 break
             change[beyond] = np.clip(wanted, low, high)[beyond]
+        assert step is not None  # there is a round at least
         np.clip(wanted, low, high, out=wanted)
         return step if free.all() else step._replace(root=None)
 
