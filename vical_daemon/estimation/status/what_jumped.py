@@ -200,7 +200,7 @@ def what_jumped(
         if after is None:
             continue
         totals = likelihood + np.asarray(after.likelihoods)
-        if totals[-1] > highest[-1]:
+        if totals[-1] > highest[-1] and all(after.used):  # what refuses images rules out no other
             highest = np.concatenate([np.full(k, -math.inf), totals])
         if totals[-1] > found.get(part, _Jump(none[-1])).likelihood:
             found[part] = _Jump(totals[-1], k, after.jumped.sizes)

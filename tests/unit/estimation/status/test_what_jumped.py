@@ -1,13 +1,14 @@
 """Tests for jumps use what the images did to the filter: they follow them again only if a jump is likely."""
 
 import numpy as np
+import pytest
 
 from tests.unit.estimation.some_filter import NAME, some_filter
-from vical_daemon.estimation.filter.jump_scores import Corrected
+from vical_daemon.estimation.filter.jump_scores import Corrected, JumpSizes
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.status import what_jumped as module
 from vical_daemon.estimation.status.recent_past import Taken
-from vical_daemon.estimation.status.what_jumped import Part, what_jumped
+from vical_daemon.estimation.status.what_jumped import Part, _After, what_jumped
 
 
 def images(f, innovation):
@@ -50,3 +51,20 @@ def test_without_refused_images_each_likely_part_is_tried_at_one_instant(monkeyp
     what_jumped(f, [taken[0]._replace(used=False), *taken[1:]], NAME, lambda *_: None)
     assert {part for part, _ in tried} > set(parts)  # the scores do not include that image
     assert len({at for part, at in tried if part is Part.MOUNTING}) > 1
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_a_jump_that_refuses_images_rules_out_no_other(monkeypatch, refuses):
+    """Refused images are not in the likelihood: a jump of the lens that refused a third of them was ahead."""
+    f, least = some_filter()[0], []
+
+    def follow(before, parts, images, camera, step, limit):
+        least.append(limit[-1])
+        used = [not refuses, *[True] * (len(images) - 1)]
+        return _After(before, [1e5 + k for k in range(len(images))], used, JumpSizes.of(np.ones((1, 1))))
+
+    monkeypatch.setattr(module, "_follow_after", lambda *x: follow(*x) if len(x) > 5 else None)
+    with pytest.raises(AssertionError):  # the last one, with all possible parts, follows nothing here
+        what_jumped(f, images(f, np.full(3, 1e3)), NAME, lambda *_: None)
+    assert len(least) > 1
+    assert (max(least[1:]) < 0.0) == refuses
