@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from copy import deepcopy
@@ -101,10 +102,11 @@ class RecentPast:
         """
         frames = [(t, frame) for t, frame, _ in self._frames.get(camera, ())]
         poses: _Poses = {}
+        sound_s = frames[-_STRETCHES[-1] :][0][0] if frames else 0.0
         for count in _STRETCHES:
             if len(frames) < count:
                 break
-            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target, poses)
+            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target, poses, sound_s)
             if fit is not None and fit.stepped:
                 return fit
         return None
@@ -152,6 +154,7 @@ class RecentPast:
         buffer: ImuBuffer,
         target: FloatArray,
         poses: _Poses | None = None,
+        sound_s: float = math.inf,
     ) -> ShiftFit | None:
         """Whether images of one camera fit the gyro at one time shift, and only there.
 
@@ -161,6 +164,8 @@ class RecentPast:
             buffer: Inertial readings.
             target: Points of the target, m, shape (n, 3).
             poses: Of images looked at before, with the same lens; others are added.
+            sound_s: Images used before this stamp, s, and before `frames`, show how well they usually fit:
+                some of those since may have been used with a time shift that had stepped.
         """
         poses = {} if poses is None else poses
         seen = _orientations(frames, f, target, poses)
@@ -168,7 +173,7 @@ class RecentPast:
             return None
         curve, known = _curve(buffer, f), f.state.cameras[frames[0][1].camera]
         used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
-        sound_s = min(frames[0][0], f.state.t_s - known.timeshift_s)
+        sound_s = min(sound_s, frames[0][0], f.state.t_s - known.timeshift_s)
         before = _orientations([x for x in used if x[0] < sound_s][-_STRETCHES[-1] :], f, target, poses)
         level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
