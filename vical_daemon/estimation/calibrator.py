@@ -426,8 +426,8 @@ class Calibrator:
         After its clock was set, or in another recording.
         """
         if isinstance(lost, RecordingStart):
-            fit = lost.shift(f.state, self._buffer, camera)
-            if fit is None and not lost.given_up:
+            fit, more = lost.shift(f.state, self._buffer, camera)
+            if fit is None and more:
                 return lost
         else:
             own = [x for x in lost.frames if x[1].camera == camera]
@@ -438,8 +438,11 @@ class Calibrator:
         if fit is None:
             return lost
         self._set_shift(f, camera, fit)
-        self._lost = again = type(lost)(self.rig.target, self._used_ns)
-        for t_cam_s, frame in lost.frames:
+        again = MotionRestart(self.rig.target, self._used_ns)
+        if isinstance(lost, RecordingStart):
+            again = RecordingStart(self.rig.target, self._used_ns, seeking=bool(self._seek_shift))
+        self._lost, cameras = again, f.state.cameras
+        for t_cam_s, frame in sorted(lost.frames, key=lambda x: x[0] + cameras[x[1].camera].timeshift_s):
             again.take(frame, t_cam_s, f.state, self._buffer)
         return again
 

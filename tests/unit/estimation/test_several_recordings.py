@@ -217,6 +217,48 @@ def test_another_clock_is_found_while_the_biases_are_not_known_either(after_firs
     assert not {e.kind for e in together.events[before:]} & {EventKind.BUMPED, EventKind.STARTED_ANEW}
 
 
+def test_the_clocks_of_two_cameras_are_found_too() -> None:
+    """Images of one in the order of its old time shift made those of the other be forgotten."""
+    turned = exp_so3(np.deg2rad([3.0, -5.0, 4.0]))
+
+    def both(seed: int, seconds: float, *late_s: float):
+        rig = another(seed)
+        beside = replace(rig, R_imu_cam=rig.R_imu_cam @ turned, p_imu_cam=rig.p_imu_cam + 0.05)
+        rigs = [
+            replace(r, timeshift_cam_imu_s=SHIFT_S + s) for r, s in zip((rig, beside), late_s, strict=True)
+        ]
+        return [simulate(seed + 100 * k, seconds, rig=r) for k, r in enumerate(rigs)]
+
+    def take(c: Calibrator, runs, later_s: float) -> None:
+        data = [(t, "", x) for t, x in items(runs[0], later_s) if isinstance(x, tuple)]
+        for name, run in zip(("cam0", "cam1"), runs, strict=True):
+            data += [(t, name, x) for t, x in items(run, later_s) if not isinstance(x, tuple)]
+        for stamp_ns, name, x in sorted(data, key=lambda x: x[0]):
+            if not name:
+                c.add_imu(stamp_ns, *x)
+            else:
+                c.add_points(PointsFrame(name, stamp_ns, x.ids, x.uv_px))
+                c.process()
+        c.finish()
+
+    runs = both(11, 12.0, 0.0, 0.05)
+    lens = runs[0].rig.lens
+    prior = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise())
+    c = Calibrator(options, {"cam0": prior, "cam1": prior}, runs[0].points_m)
+    take(c, runs, 0.0)
+    before = len(c.estimate().events)
+    c.next_recording(common_clock=False)
+    take(c, both(43, 8.0, 0.3, -0.2), 20.0)
+    together = c.estimate()
+    assert together.status is Status.CONVERGED
+    for name, late_s in (("cam0", 0.3), ("cam1", -0.2)):
+        camera = together.cameras[name]
+        off_s = camera.timeshift_cam_imu_s - SHIFT_S - late_s
+        assert abs(off_s) < 4.0 * camera.timeshift_sigma_s < 2e-3, name
+    assert not {e.kind for e in together.events[before:]} & {EventKind.BUMPED, EventKind.STARTED_ANEW}
+
+
 def test_without_a_target_too() -> None:
     first = simulate_tracks(1, 14.0, rig=reference_rig(1, timeshift_cam_imu_s=SHIFT_S), camera_rate_hz=10.0)
     # the tracks of a room: the world's z is up, and stays so

@@ -113,8 +113,10 @@ class MotionRestart:
             buffer: Inertial readings.
         """
         t_s = t_cam_s + _camera(state, frame).timeshift_s
-        if self.frames:
-            before_s = self.frames[-1][0] + _camera(state, self.frames[-1][1]).timeshift_s
+        # of the same camera: the clocks of others may still be off
+        before_s = next((t for t, kept in reversed(self.frames) if kept.camera == frame.camera), None)
+        if before_s is not None:
+            before_s += _camera(state, frame).timeshift_s
             if t_s < before_s or buffer.gap_within(before_s, t_s):
                 self.frames, self._seen = [], []
         if t_s < buffer.oldest_s or buffer.gap_within(t_s, t_s):
@@ -289,15 +291,12 @@ class RecordingStart(MotionRestart):
         target: Points of the target, m, shape (n, 3).
         before_ns: See `MotionRestart`.
         seeking: A time shift is to be found first, see `shift`; images are kept for longer.
-
-    Attributes:
-        given_up: Images do not show the time shift, and no more of them are kept.
     """
 
     def __init__(self, target: FloatArray, before_ns: Mapping[str, int], *, seeking: bool = False) -> None:
         super().__init__(target, before_ns)
-        self._longest_s, self._attempts = LONG_S if seeking else _MOST_S, Attempts(first_s=0.5)
-        self.given_up = False
+        self._longest_s = LONG_S if seeking else _MOST_S
+        self._attempts: dict[str, Attempts] = {}  # by camera
 
     def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
         """See `MotionRestart.take`; images of long ago are left out."""
@@ -330,7 +329,7 @@ class RecordingStart(MotionRestart):
             float(poses.t_s[0]), poses.R[0], start.p_world_cam, start.v_world_imu, wide, 0.0, biases
         )
 
-    def shift(self, state: State, buffer: ImuBuffer, camera: str) -> ShiftFit | None:
+    def shift(self, state: State, buffer: ImuBuffer, camera: str) -> tuple[ShiftFit | None, bool]:
         """Time shift of a camera whose clock may be off by seconds, by its turns and the gyro's.
 
         The bias is not known either, and a wrong time shift gives a wrong bias: both are found together.
@@ -341,24 +340,25 @@ class RecordingStart(MotionRestart):
             camera: Its name.
 
         Returns:
-            None: not known so far.
+            The fit, or None; and whether more images may show it.
         """
         poses = [s for s in self._seen if s is not None and s.frame.camera == camera]
         span_s = poses[-1].t_cam_s - poses[0].t_cam_s if poses else 0.0
-        if len(poses) < MIN_ORIENTATIONS or span_s < _SHIFT_S or not self._attempts.due(poses[-1].t_cam_s):
-            return None
-        self._attempts.tried(poses[-1].t_cam_s)
+        attempts = self._attempts.setdefault(camera, Attempts(first_s=0.5))
+        if len(poses) < MIN_ORIENTATIONS or span_s < _SHIFT_S or not attempts.due(poses[-1].t_cam_s):
+            return None, True
+        attempts.tried(poses[-1].t_cam_s)
         known, rows = state.cameras[camera], buffer.rows
         t_s, R = np.array([p.t_cam_s for p in poses]), np.array([p.R_target_cam for p in poses])
         found = td_icp(rows[:, 0], rows[:, 1:4], t_s, R, attitude_sigmas(poses, known))
         if found.still:
             self.drop_before(float(t_s[-1]))
-            return None
-        off_rad = float(np.linalg.norm(so3.log(found.R_imu_cam.T @ known.R_imu_cam)))
-        if found.status != "ok" or not (off_rad < _MOUNTED_RAD and found.timeshift_sigma_s < _SHIFT_SIGMA_S):
-            self.given_up = span_s > self._longest_s - _SHIFT_S
-            return None
-        return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True)
+            return None, True
+        if found.status == "ok" and found.timeshift_sigma_s < _SHIFT_SIGMA_S:
+            off_rad = float(np.linalg.norm(so3.log(found.R_imu_cam.T @ known.R_imu_cam)))
+            if off_rad < _MOUNTED_RAD:
+                return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True), True
+        return None, span_s < self._longest_s - _SHIFT_S
 
 
 def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> FloatArray | None:
