@@ -270,8 +270,9 @@ class Calibrator:
         lost.take(frame, t_cam_s, f.state, self._buffer)
         if frame.camera in self._seek_shift:
             lost = self._seek(f, lost, frame.camera)
-        if not self._seek_shift.isdisjoint(kept.camera for _, kept in lost.frames):
+        if lost.saw_lately(self._seek_shift, t_cam_s):
             return []
+        lost.leave_out(self._seek_shift)
         self._trim(lost.frames[0][0] if lost.frames else t_cam_s)
         motion = lost.motion(f, self._buffer)
         if motion is None:

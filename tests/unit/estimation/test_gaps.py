@@ -240,6 +240,31 @@ def test_two_cameras_go_on_together_after_a_gap(run):
     assert c.estimate().status == Status.CONVERGED
 
 
+def test_a_camera_whose_clock_is_set_just_before_it_dies_does_not_hold_up_the_other(run):
+    lens = run.rig.lens
+    prior = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise())
+    c = Calibrator(options, {"cam0": prior, "cam1": prior}, run.points_m)
+    left = 3  # images of it, from then on
+    for t_s, kind, stamp_ns, content in stream(run):
+        if not kind:
+            c.add_imu(stamp_ns, *content)
+            continue
+        if t_s > BEGIN_S and left == 3:
+            c.process()
+            c._clock_was_set("cam1")
+        if t_s < BEGIN_S or left:
+            c.add_points(replace(content, camera="cam1"))
+            left -= t_s > BEGIN_S
+        elif t_s > BEGIN_S + 1.0:
+            c.do_without(frozenset({"cam1"}))
+        c.add_points(content)
+        c.process()
+    c.finish()
+    assert c.filter is not None
+    assert c.filter.state.t_s > END_S - 0.5
+
+
 def test_the_motion_found_anew_is_the_true_one(run, so_far):
     c, events, shots = pickle.loads(so_far)
     follow(c, events, shots, [x for x in stream(run) if COMMON_S <= x[0] < BEGIN_S + BACK_S])

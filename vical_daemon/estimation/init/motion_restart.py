@@ -12,7 +12,7 @@ be wrong with the images of a camera widens its poses, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +55,9 @@ from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
 _WIDE = 0.03
 """Sigma up to which images are near to linear: of attitude, rad; of position, over the target's distance."""
-_WAIT_S = 2.0  # for an image that shows the pose so well: a board comes back into view within seconds, or not
+_WAIT_S = 2.0
+"""For an image that shows the pose so well, or for a camera whose clock was set: a board comes back into view
+within seconds, or not."""
 _WIDE_MPS = 0.3  # of velocity: ten times what a board in full view gives
 _RECORDING_IMAGES = 8  # of another recording, with poses: fewer do not show which of them are wrong
 _RECORDING_S = 1.5
@@ -126,6 +128,15 @@ class MotionRestart:
             return
         self.frames.append((t_cam_s, frame))
         self._seen.append(seen)
+
+    def saw_lately(self, cameras: Collection[str], t_cam_s: float) -> bool:
+        """Whether one of some cameras has sent an image within the last seconds; `t_cam_s`: now, s."""
+        return any(kept.camera in cameras and t_cam_s - t < _WAIT_S for t, kept in self.frames)
+
+    def leave_out(self, cameras: Collection[str]) -> None:
+        """Forget the images of some cameras."""
+        keep = [k for k, (_, frame) in enumerate(self.frames) if frame.camera not in cameras]
+        self.frames, self._seen = [self.frames[k] for k in keep], [self._seen[k] for k in keep]
 
     def drop_before(self, t_cam_s: float) -> None:
         """Leave images out that were stamped before `t_cam_s`, and those after them up to one with a pose."""
