@@ -63,9 +63,6 @@ _RECORDING_IMAGES = 8  # of another recording, with poses: fewer do not show whi
 _RECORDING_S = 1.5
 """Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
 _SHIFT_S = 2.0  # of images from which on a time shift is looked for: two swings of a hand
-_SHIFT_SIGMA_S, _MOUNTED_RAD = 4e-3, float(np.deg2rad(3.0))
-"""A time shift found as well as this is kept (0.2 deg at 60 deg/s), if the mounting found with it is near to
-that which is known: turns over some seconds show it to a degree."""
 _MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now
 _POSITION_SIGMA_M = 2e-3  # of a pose of the target, m: weighs the prior of the bias
 
@@ -359,16 +356,14 @@ class RecordingStart(MotionRestart):
         if len(poses) < MIN_ORIENTATIONS or span_s < _SHIFT_S or not attempts.due(poses[-1].t_cam_s):
             return None, True
         attempts.tried(poses[-1].t_cam_s)
-        known, rows = state.cameras[camera], buffer.rows
+        rows = buffer.rows
         t_s, R = np.array([p.t_cam_s for p in poses]), np.array([p.R_target_cam for p in poses])
-        found = td_icp(rows[:, 0], rows[:, 1:4], t_s, R, attitude_sigmas(poses, known))
+        found = td_icp(rows[:, 0], rows[:, 1:4], t_s, R, attitude_sigmas(poses, state.cameras[camera]))
         if found.still:
             self.drop_before(float(t_s[-1]))
             return None, True
-        if found.status == "ok" and found.timeshift_sigma_s < _SHIFT_SIGMA_S:
-            off_rad = float(np.linalg.norm(so3.log(found.R_imu_cam.T @ known.R_imu_cam)))
-            if off_rad < _MOUNTED_RAD:
-                return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True), True
+        if found.status == "ok":
+            return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True), True
         return None, span_s < self._longest_s - _SHIFT_S
 
 
