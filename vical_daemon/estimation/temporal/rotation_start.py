@@ -239,6 +239,10 @@ class GyroReference:
         """Every mirrored mounting is this and a rotation."""
         return replace(self, gyro_rps=self.gyro_rps * np.array([-1.0, 1.0, 1.0]))
 
+    def scaled(self, factor: float) -> GyroReference:
+        """The same in another unit."""
+        return replace(self, gyro_rps=self.gyro_rps * factor)
+
 
 @dataclass(frozen=True)
 class StreamReference:
@@ -265,6 +269,9 @@ class StreamReference:
 
     def mirrored(self) -> None:
         """Orientations are rotations: no axis can be reversed."""
+
+    def scaled(self, _factor: float) -> None:
+        """They have no unit."""
 
 
 Reference = GyroReference | StreamReference

@@ -1,7 +1,7 @@
 """Why temporal calibration gives no answer, or only part of one, in words a person can act on.
 
 Where rotations do not fit, orientations may be inverted, the gyro mirrored (an axis of the wrong sign, two
-swapped), or stamps stretched. From the misfit alone these look alike: for small turns, inverted orientations
+swapped) or in degrees, or stamps stretched. From the misfit alone these look alike: for small turns, inverted orientations
 are a mirrored mounting. So the start is repeated with each mistake undone, and the one that makes the
 rotations fit is named (`explain`).
 """
@@ -39,6 +39,10 @@ _TURNS = 80  # enough to tell factors apart
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
 _ROTATION_LOST_RAD = float(np.deg2rad(3.0))  # likewise of a mounting, which by eye is known as well
+_UNITS = {
+    np.pi / 180.0: "look like degrees per second (factor 57.3); convert them to rad/s",
+    180.0 / np.pi: "look as if divided by 57.3 once too often; they must be in rad/s",
+}  # what rates are multiplied by to be rad/s
 _UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
 
@@ -77,6 +81,10 @@ def explain(
             "the rotations are mirrored: one gyro axis has the wrong sign, or two axes are swapped; the IMU "
             "frame must be right-handed"
         )
+    for factor, unit in _UNITS.items():
+        scaled = reference.scaled(factor)
+        if scaled and _score(scaled.start(t_s, q_world_sensor, shifts_s)[0]) < limit:
+            return f"the gyro's rates {unit} (then the rotations fit)"
     factor = estimate_clock_rate(reference.curve(np.zeros(3)), t_s, q_world_sensor, shifts_s)
     return "" if factor is None else stretched(1.0 / factor - 1.0, reference)
 
@@ -201,7 +209,7 @@ def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, option
             f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither "
             "delay nor mounting about that axis show; turn back and forth, and about other axes"
         )
-    return Refusal(_wrong_unit(ratio))
+    return Refusal()
 
 
 def is_constant_rotation(t_imu: FloatArray, gyro: FloatArray) -> bool:
@@ -230,21 +238,6 @@ def _mean_rates(t_imu: FloatArray, gyro: FloatArray) -> FloatArray:
 def _changes(rates: FloatArray) -> FloatArray:
     out: FloatArray = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
     return out
-
-
-def _wrong_unit(ratio: float) -> str:
-    """Say when the gyro's rates over the camera's look like degrees taken for radians, or the reverse."""
-    if 35.0 < ratio < 95.0:
-        return (
-            f"the gyro's rates are {ratio:.1f} times the camera's: they look like degrees per second "
-            "(factor 57.3); convert them to rad/s"
-        )
-    if 1 / 95.0 < ratio < 1 / 35.0:
-        return (
-            f"the gyro's rates are {1 / ratio:.1f} times smaller than the camera's: they look as if divided "
-            "by 57.3 once too often; they must be in rad/s"
-        )
-    return ""
 
 
 def refuse_start(start: Start | None, options: TdIcpOptions) -> str:

@@ -153,6 +153,29 @@ def test_swapped_gyro_axes_and_inverted_orientations_are_refused():
     assert inverted.status == "refused" and inverted.reason
 
 
+@pytest.mark.parametrize(("factor", "said"), [(1 / DEG, "degrees per second"), (DEG, "divided by 57.3")])
+def test_a_gyro_in_another_unit_is_named(factor, said):
+    t_imu, gyro, t_cam, R, *_ = record(15)
+    result = td_icp(t_imu, gyro * factor, t_cam, R)
+    assert result.status == "refused" and said in result.reason
+
+
+def test_a_rig_that_turns_for_less_than_half_of_the_time_is_no_wrong_unit_of_the_gyro():
+    """It moves along without turning in between; orientations from tracks then err by a degree."""
+
+    class Halting(Motion):
+        def vector(self, t):
+            since = np.mod(t, 4.0)
+            return super().vector(t) * np.exp(-(((since - 0.9) / 0.5) ** 4))[:, None]
+
+    motion = Halting(15)
+    t_imu, _, t_cam, R, *_ = record(15, 0.05, 20.0, motion)
+    t = t_cam + 0.05
+    R = R @ so3.exp(1.0 * DEG * np.stack([np.sin(4 * t), np.sin(5 * t), np.cos(4.4 * t)], axis=1))
+    result = td_icp(t_imu, motion.rate(t_imu), t_cam, R)
+    assert "57.3" not in result.reason
+
+
 def test_another_recording_is_refused():
     t_imu, gyro, *_ = record(16)
     _, _, t_cam, R, *_ = record(17)
