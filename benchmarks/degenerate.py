@@ -38,6 +38,7 @@ MOTIONS: dict[str, Callable[[int], Trajectory]] = {
     "constant rate": lambda _: trajectory.constant_rate(T_imu_cam=_MOUNT),
     "fronto-parallel": lambda seed: trajectory.fronto_parallel(seed, T_imu_cam=_MOUNT),
     "planar": lambda seed: trajectory.planar(seed, T_imu_cam=_MOUNT),
+    "about one point": lambda seed: trajectory.about_a_point(seed, T_imu_cam=_MOUNT),
     "slow 1 deg/s": lambda seed: trajectory.hand_motion(seed, 1.0, T_imu_cam=_MOUNT),
     "hand (control)": lambda seed: trajectory.hand_motion(seed, T_imu_cam=_MOUNT),
 }

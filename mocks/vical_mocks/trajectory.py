@@ -318,6 +318,26 @@ def planar(
     return Trajectory(turn, drive, _viewing_base(side), _imu_in_camera(T_imu_cam))
 
 
+def about_a_point(
+    seed: int,
+    point_m: npt.ArrayLike = (0.02, 0.11, -0.04),
+    *,
+    T_imu_cam: Pose | None = None,
+    board_size_m: tuple[float, float] = BOARD_SIZE_M,
+    distance_m: float = 0.6,
+    side: int = -1,
+) -> Trajectory:
+    """A tripod's head: turns about all axes and about one point, given in the frame of the camera, shape (3,).
+
+    Without a board the scale is lost, and with it the lever arm along the line from the point to the camera.
+    """
+    rng = np.random.default_rng([seed, 16])
+    turn = _three_waves(rng, np.zeros(3), np.deg2rad([6.0, 6.0, 8.0]), (0.4, 1.3))
+    R, p = _imu_in_camera(T_imu_cam)
+    place = Sinusoids(_viewpoint(board_size_m, distance_m, side))
+    return Trajectory(turn, place, _viewing_base(side), (R, p - np.asarray(point_m)))
+
+
 def _three_waves(
     rng: np.random.Generator, middle: FloatArray, amplitude: FloatArray, hz: tuple[float, float]
 ) -> Sinusoids:

@@ -268,7 +268,7 @@ _CAUSES = {
     Cause.FEATURES_MISS: "features are {:.1f} px from where they are expected",
     Cause.INERTIAL_MISFIT: "inertial data and images disagree ({:.1f} times their noise)",
     Cause.SCENE_MOVES: "{:.0%} of the features do not move with the scene",
-    Cause.NO_PARALLAX: "the camera stands still, everything is far away, or features are lost before they "
+    Cause.NO_PARALLAX: "the camera only turns, everything is far away, or features are lost before they "
     "show depth",
     Cause.SECOND_AXIS: "the rig now turns about a second axis: restarting, to estimate the whole lever arm",
     Cause.COLUMNS_READ: "the images show that the shutter reads columns: restarting with that",

@@ -23,7 +23,7 @@ from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.wording import cause_text
 
-DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
+DOES_NOT_FIT = "the first seconds do not fit together yet: move the rig to and fro while turning it"
 
 
 class Begun(NamedTuple):

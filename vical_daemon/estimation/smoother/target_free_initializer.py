@@ -172,8 +172,6 @@ class TargetFreeInitializer:
         arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
         try:
             start = TrackStart(buffer, frames, camera, found.imu, noise, gravity)
-            if found.arm_sigma_m >= WINDOW_START.lever_arm_m and start.turns_about_a_point():
-                return "the rig turns about one point, which shows no distances: move it to and fro as well"
             if found.about is not None:
                 camera.R_imu_cam = mounting_about(start, found.about, camera.R_imu_cam, arm)
             window = start.window(arm)

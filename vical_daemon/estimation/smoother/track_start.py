@@ -37,10 +37,6 @@ ROUNDS = 8  # of reweighting by the depths found and by outliers
 _RAY_SIGMA = 2e-3  # of a ray, rad: 1 px at a focal length of 500 px
 _STEP_RAD = float(np.deg2rad(15.0))  # between the angles tried first
 _APART_RAD = 3.0 * _STEP_RAD  # from here on it is another mounting
-_STILL_M = 1e-3
-"""A point that moves less than this in `_SPAN_S`, RMS, stands still: errors of 1 % in the scale of an
-accelerometer move points by up to 0.5 mm."""
-_SPAN_S = 4.0  # longer, a gyro's noise tilts gravity by enough to move points, too
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
 
@@ -132,22 +128,6 @@ class TrackStart:
         """How badly features' rays meet with this mounting: median angle, rad; infinite without solution."""
         found = self._solve(R_imu_cam, arm, rounds)
         return np.inf if found is None else found.misfit
-
-    def turns_about_a_point(self) -> bool:
-        """Whether some point of the rig stands still: then nothing shows the scale, nor the lever arm.
-
-        With that point at the origin, lever arm and distances may grow together: images stay the same, and
-        the accelerometer feels only its own distance from the point.
-        """
-        T, D, A = self._motion
-        moves = 0.0
-        for begin in np.arange(0.0, max(T[-1] - 0.5 * _SPAN_S, 0.1), 0.5 * _SPAN_S):
-            now = (T >= begin) & (T <= begin + _SPAN_S)
-            columns = np.concatenate([A[now], np.broadcast_to(np.eye(3), (np.count_nonzero(now), 3, 3))], axis=2)
-            columns = columns.reshape(-1, columns.shape[2])
-            left = columns @ np.linalg.lstsq(columns, D[now].ravel())[0] - D[now].ravel()
-            moves = max(moves, float(np.sqrt(3.0 * np.mean(left**2))))
-        return moves < _STILL_M
 
     def window(self, arm: ArmPrior) -> Window:
         """Return the window that a bundle adjustment can start from: world z up, first image at the origin.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks import trajectory
-from vical_mocks.curves import Curve, Pause, Paused
+from vical_mocks.curves import Curve, Pause, Paused, Sinusoids
 from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 from vical_mocks.tracks import simulate_tracks
@@ -158,3 +158,19 @@ def test_a_drive_that_does_not_show_the_lens_starts_with_the_lens_as_given():
     assert record.snapshots
     sigma = np.sqrt(np.diag(record.snapshots[-1].covariance))[:7]
     assert np.abs(record.snapshots[-1].error[:7] / sigma).max() < 4.0
+
+
+def test_turns_about_a_point_never_converge():
+    """On a tripod's head, 12 cm from the camera: lever arm and distances may grow together."""
+    run = run_of(trajectory.about_a_point(1, T_imu_cam=MOUNT), seconds=12.0)
+    record = feed(run, subject_for(run))
+    assert "converged" not in {status for _, status, _ in record.statuses}
+
+
+def test_turns_about_a_point_that_sways_give_an_answer():
+    head = trajectory.about_a_point(1, T_imu_cam=MOUNT)
+    sway = Sinusoids(np.zeros(3), np.full((1, 3), 0.02), np.array([[0.5, 0.6, 0.7]]), np.zeros((1, 3)))
+    there = Sum(head.position, sway)
+    motion = trajectory.Trajectory(head.rotation, there, head.R_world_base0, (head.R_base_imu, head.p_base_imu))
+    run = run_of(motion, seconds=8.0)
+    assert feed(run, subject_for(run)).snapshots
