@@ -327,7 +327,7 @@ def about_a_point(
     distance_m: float = 0.6,
     side: int = -1,
 ) -> Trajectory:
-    """A tripod's head: turns about all axes and about one point, given in the frame of the camera, shape (3,).
+    """A tripod's head: turns about all axes and one point, in the frame of the camera, m, shape (3,).
 
     Without a board the scale is lost, and with it the lever arm along the line from the point to the camera.
     """

@@ -1,9 +1,9 @@
 """Why temporal calibration gives no answer, or only part of one, in words a person can act on.
 
 Where rotations do not fit, orientations may be inverted, the gyro mirrored (an axis of the wrong sign, two
-swapped) or in degrees, or stamps stretched. From the misfit alone these look alike: for small turns, inverted orientations
-are a mirrored mounting. So the start is repeated with each mistake undone, and the one that makes the
-rotations fit is named (`explain`).
+swapped) or in degrees, or stamps stretched. From the misfit alone these look alike: for small turns, inverted
+orientations are a mirrored mounting. So the start is repeated with each mistake undone, and the one that
+makes the rotations fit is named (`explain`).
 """
 
 from __future__ import annotations

@@ -171,6 +171,7 @@ def test_turns_about_a_point_that_sways_give_an_answer():
     head = trajectory.about_a_point(1, T_imu_cam=MOUNT)
     sway = Sinusoids(np.zeros(3), np.full((1, 3), 0.02), np.array([[0.5, 0.6, 0.7]]), np.zeros((1, 3)))
     there = Sum(head.position, sway)
-    motion = trajectory.Trajectory(head.rotation, there, head.R_world_base0, (head.R_base_imu, head.p_base_imu))
+    mount = (head.R_base_imu, head.p_base_imu)
+    motion = trajectory.Trajectory(head.rotation, there, head.R_world_base0, mount)
     run = run_of(motion, seconds=8.0)
     assert feed(run, subject_for(run)).snapshots
