@@ -136,8 +136,7 @@ class CalibrationFilter:
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
         if self.jumped is not None:
-            d = self.layout.dynamic
-            self.jumped.predict(moved.linear, self.S[:d, :d])
+            self.jumped.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
             self._drift(self.jumped.D, self.jumped.D, moved.seconds)
         self._grow(moved, Q)
         self._predict_score(moved, Q)
@@ -321,8 +320,7 @@ class CalibrationFilter:
         return lin
 
     def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
-        lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
-        return self._with_shared(image, lin)
+        return self._with_shared(image, by_sigma_points(self.state, self.layout, self.rates, image, dx, S))
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
@@ -330,13 +328,18 @@ class CalibrationFilter:
         for s in turned:
             x, y, z = (0.5 * dx[s]).tolist()
             if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
-                unscented.turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
+                self._turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
         g = self.state.gravity
         turn = so3.hat(g) @ dx[GRAVITY] / (g @ g)
         if max(abs(turn)) > 2.0 * _TURNED_RAD:
-            unscented.turn_rows(S, GRAVITY, so3.exp_one(turn))
+            self._turn_rows(S, GRAVITY, so3.exp_one(turn))
         self.S = S
         self.state = retract(self.state, self.layout, dx)
+
+    def _turn_rows(self, S: FloatArray, rows: slice, T: FloatArray) -> None:
+        unscented.turn_rows(S, rows, T)
+        if self.jumped is not None:
+            self.jumped.D[rows] = T @ self.jumped.D[rows]
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
         """Bias that this image adds to the information vector, see `LeverArmScore.update`."""
@@ -394,9 +397,7 @@ class CalibrationFilter:
 
     def reopen(self, index: int, sigma: float) -> None:
         """Add independent uncertainty to one error."""
-        column = np.zeros(self.layout.size)
-        column[index] = sigma
-        self.inflate_covariance(column)
+        self.inflate_covariance(sigma * unscented.unit(self.layout.size)[index])
 
     def inflate_covariance(self, columns: FloatArray) -> None:
         """Add the covariance `columns columns'`; directions of the errors, shape (n,) or (n, k)."""

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 from scipy.special import logsumexp
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from vical_mocks.points import simulate
+from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.filter.jump_scores import SIZES, Corrected, JumpScores, JumpSizes, Moved
+from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.model.unscented import solve_lower
 
 IMAGES, SIGMA = 12, np.array([0.7, 0.4])
 NOISE, SECONDS, DRIFTS = 1e-3 * np.eye(12), 0.3, [(11, 10)]
@@ -92,3 +97,21 @@ def test_sizes_are_those_of_filters_that_estimate_the_jump(problem):
     assert jumped.any_size == pytest.approx(logsumexp(totals) - np.log(len(SIZES)) - totals[0], abs=1e-9)
     expected = np.exp(totals - logsumexp(totals)) @ squares
     assert jumped.sizes == pytest.approx(np.sqrt(expected), abs=1e-9)
+
+
+def test_a_jump_is_never_known_better_than_the_state_after_it(monkeypatch):
+    """Nor after a turn that is large: the covariance with the jump is in the errors of the moved state."""
+    rig = reference_rig(3, timeshift_cam_imu_s=0.01, bumps=(Bump(12.0, tuple(np.deg2rad([2.0, -1.0, 2.0]))),))
+    run = simulate(3, 14.0, rig=rig)
+    ordinary, least = JumpSizes.correct, []
+
+    def correct(self, before, after, dx):
+        by_jump = solve_lower(before, self.D)
+        least.append(np.linalg.eigvalsh(self.covariance - by_jump.T @ by_jump)[0])
+        ordinary(self, before, after, dx)
+
+    monkeypatch.setattr(JumpSizes, "correct", correct)
+    options = CalibrationOptions(imu_noise=imu_noise(run))
+    feed(run, CalibratorSubject(options, camera_prior(run, 3, StartErrors(), exact_lens=False), run.points_m))
+    assert len(least) > 100
+    assert min(least) > -1e-6
