@@ -209,12 +209,12 @@ class Gx3Emulator:
         if self._master < 0:
             return _IDLE_S
         now_s = time.monotonic()
+        if self._openers.closed_by_all():
+            self._forget_host()
         if now_s < self._dark_until_s:
             with contextlib.suppress(OSError):  # whatever the host says is lost
                 os.read(self._master, 4096)
             return min(self._dark_until_s - now_s, _IDLE_S)
-        if self._openers.closed_by_all():
-            self._forget_host()
         self._take_input(now_s)
         for t_s, data in self.device.advance(now_s):
             self._link.push(data, t_s)
