@@ -182,8 +182,9 @@ def simulate_imu(
     """
     step_s = 1.0 / options.imu_rate_hz
     t_s = np.arange(0.0, duration_s + step_s / 2, step_s)
-    gyro = _averaged(rig, t_s, options.imu_average_s)[0]
-    force = _averaged(rig, t_s - options.accel_lag_s, options.imu_average_s)[1]
+    gyro, force = _averaged(rig, t_s, options.imu_average_s)
+    if options.accel_lag_s:
+        force = _averaged(rig, t_s - options.accel_lag_s, options.imu_average_s)[1]
     root_rate = np.sqrt(options.imu_rate_hz)
     gyro = gyro + rig.densities.gyro * root_rate * rng.standard_normal(gyro.shape)
     force = force + rig.densities.accel * root_rate * rng.standard_normal(force.shape)

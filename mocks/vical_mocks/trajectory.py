@@ -55,24 +55,27 @@ class Trajectory:
     def v_world_imu(self, t_s: npt.ArrayLike) -> FloatArray:
         """Velocity in the world, m/s, shape (..., 3)."""
         t = np.asarray(t_s, np.float64)
-        rate, _ = self._base_rates(t)
-        lever = np.cross(rate, self.p_base_imu)
-        return self.position.evaluate(t)[1] + _apply(self._R_world_base(t), lever)
+        theta, first, _ = self.rotation.evaluate(t)
+        lever = np.cross(body_rate(theta, first), self.p_base_imu)
+        return self.position.evaluate(t)[1] + _apply(self.R_world_base0 @ exp_so3(theta), lever)
 
     def a_world_imu(self, t_s: npt.ArrayLike) -> FloatArray:
         """Acceleration in the world (without gravity), m/s^2, shape (..., 3)."""
         t = np.asarray(t_s, np.float64)
-        rate, acceleration = self._base_rates(t)
+        theta, first, second = self.rotation.evaluate(t)
+        rate, acceleration = body_rate(theta, first), body_acceleration(theta, first, second)
         lever = np.cross(acceleration, self.p_base_imu) + np.cross(rate, np.cross(rate, self.p_base_imu))
-        return self.position.evaluate(t)[2] + _apply(self._R_world_base(t), lever)
+        return self.position.evaluate(t)[2] + _apply(self.R_world_base0 @ exp_so3(theta), lever)
 
     def omega_imu_rps(self, t_s: npt.ArrayLike) -> FloatArray:
         """Angular rate of the imu, in the imu frame, rad/s, shape (..., 3)."""
-        return np.asarray(self._base_rates(np.asarray(t_s, np.float64))[0] @ self.R_base_imu)
+        theta, first, _ = self.rotation.evaluate(np.asarray(t_s, np.float64))
+        return np.asarray(body_rate(theta, first) @ self.R_base_imu)
 
     def alpha_imu_rps2(self, t_s: npt.ArrayLike) -> FloatArray:
         """Angular acceleration of the imu, in the imu frame, rad/s^2, shape (..., 3)."""
-        return np.asarray(self._base_rates(np.asarray(t_s, np.float64))[1] @ self.R_base_imu)
+        curve = self.rotation.evaluate(np.asarray(t_s, np.float64))
+        return np.asarray(body_acceleration(*curve) @ self.R_base_imu)
 
     def mean_rate_dps(self, duration_s: float = 60.0) -> float:
         """Mean of the angular rate's magnitude over the first `duration_s`, deg/s."""
@@ -90,10 +93,6 @@ class Trajectory:
 
     def _R_world_base(self, t: FloatArray) -> FloatArray:
         return np.asarray(self.R_world_base0 @ exp_so3(self.rotation.evaluate(t)[0]))
-
-    def _base_rates(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        theta, first, second = self.rotation.evaluate(t)
-        return body_rate(theta, first), body_acceleration(theta, first, second)
 
 
 def _apply(R: FloatArray, v: FloatArray) -> FloatArray:
