@@ -5,6 +5,7 @@ A test marked `root` is skipped for everybody else.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ LONGEST_FIRST = (  # in turn those that mostly wait and those that compute: `pyt
     "test_gx3_faults.py",
     "test_partial_start.py",
     "test_slow_motion.py",
+    "test_fast_motion.py",
     "test_mounting_changes.py",
     "test_verify_service.py",
     "test_run_processes.py",
@@ -32,6 +34,7 @@ LONGEST_FIRST = (  # in turn those that mostly wait and those that compute: `pyt
     "test_changes.py",
     "test_web_hostile.py",
     "test_any_numbers.py",
+    "test_wrong_units.py",
     "test_calibrate.py",
     "test_bus_access.py",
     "test_target_size.py",
@@ -50,6 +53,7 @@ LONGEST_FIRST = (  # in turn those that mostly wait and those that compute: `pyt
     "test_frame_source_contract.py",
     "test_held_back.py",
     "test_model_selection.py",
+    "test_gravity.py",
     "test_rolling_shutter_correction.py",
     "test_calibrate_traffic.py",
     "test_start.py",
@@ -116,3 +120,9 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what needs root, before any of its fixtures."""
     if item.get_closest_marker("root") and os.geteuid() != 0:
         pytest.skip("needs root: sudo .venv/bin/python -m pytest -m root tests")
+
+
+def pytest_collection_finish() -> None:
+    """Keep Python's garbage collector from looking again and again through thousands of collected tests."""
+    gc.collect()
+    gc.freeze()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +27,19 @@ def rng() -> np.random.Generator:
 
 def a_motion(rate_hz: float = 200.0, seconds: float = 12.0):
     """Stamps, rates and specific forces of an imu that is turned about all axes in gravity."""
+    t_ns, gyro, force = _a_motion(rate_hz, seconds)
+    return t_ns.copy(), gyro.copy(), force.copy()
+
+
+@cache
+def _a_motion(rate_hz: float, seconds: float):
     t_s = np.arange(0, seconds, 1 / rate_hz)
     gyro = np.stack([1.1 * np.sin(1.3 * t_s), 0.9 * np.cos(1.7 * t_s), 0.6 * np.sin(0.9 * t_s + 1)], axis=1)
     R = np.eye(3)
     force = np.empty_like(gyro)
-    for i, rate in enumerate(gyro):
+    for i, turn in enumerate(Rotation.from_rotvec(gyro / rate_hz).as_matrix()):
         force[i] = R.T @ np.array([0.0, 0.0, 9.81])
-        angle = np.linalg.norm(rate) / rate_hz
-        axis = rate / np.linalg.norm(rate)
-        K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        R = R @ (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+        R = R @ turn
     t_ns = 1_600_000_000_000_000_000 + np.round(t_s * 1e9).astype(np.int64)
     return t_ns, gyro, force
 
