@@ -14,6 +14,7 @@ from vical_drivers.user_files import read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.asl import AslRecording
+from vical_daemon.logs.asl_tables import is_table
 from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
@@ -189,7 +190,7 @@ def _open(
         return BagRecording(path.parent, topics, as_recorded=as_recorded)
     if is_bag(path):
         return BagRecording(path, topics, as_recorded=as_recorded)
-    if path.is_file() and path.name.endswith((".csv", ".csv.gz")):
+    if path.is_file() and is_table(path):
         return AslRecording(path, topics, as_recorded=as_recorded)
     raise RecordingError(f"{path} {_why_not(path)}")
 

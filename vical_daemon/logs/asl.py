@@ -5,7 +5,6 @@ Folders of Kalibr's `kalibr_bagcreater` as well: ``imu0.csv`` next to ``cam0/``,
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,17 +37,17 @@ from vical_daemon.logs.model import (
     stream_statistics,
 )
 from vical_daemon.logs.stamp_column import column_ns
-from vical_daemon.logs.stamps import StampError, numbers, set_back_s
+from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back_s
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 from vical_daemon.logs.two_tables import one_table, read_sensor, two_tables
 from vical_daemon.logs.united_imu import forces_at
 from vical_daemon.logs.what_is_there import images_in, what_is_there
 
 RIG = "rig0"
+_CAMERAS = ("cam*", "image_[0-9]*")  # KITTI has image_00 to image_03
 _UNITED = "imu0"  # name of an IMU of two tables
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
-_DATE = re.compile(r"\d{4}-\d\d-\d\d")  # ISO 8601
 _MOST_FRESH = 0.8  # share of stamps that come once; below it two devices may share a table
 _BLOCK = 4096  # readings that are turned into messages together
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
@@ -114,7 +113,7 @@ class AslRecording(Recording):
                 self._sources.append(self._read_imu(table, name))
         if not imus and (names is None or _UNITED in names):
             self._sources.extend(self._imu_of_others(root))
-        folders = sorted(path for path in root.glob("cam*") if path.is_dir())
+        folders = sorted(p for name in _CAMERAS for p in root.glob(name) if p.is_dir())
         wanted = [path for path in folders if path.name in cameras] or folders
         for camera in wanted:
             if names is not None and camera.name not in names:
@@ -256,8 +255,7 @@ class AslRecording(Recording):
         try:
             column = column_ns(numbers(stamps), "", imu=False)
         except StampError as error:
-            advice = "; write dates as nanoseconds since 1970" if _DATE.match(stamps[error.index]) else ""
-            raise RecordingError(f"{table}: the stamp {stamps[error.index]} is no number{advice}") from None
+            raise RecordingError(f"{table}: {not_a_stamp(stamps[error.index])}") from None
         self._note_stamps(folder.name, column.sigma_s, column.report)
         order = np.argsort(column.t_ns, kind="stable")
         t_ns = column.t_ns[order]
@@ -297,11 +295,8 @@ class AslRecording(Recording):
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
             column = column_ns(stamps, title, imu=dtype == _IMU_ROW)
         except StampError as error:
-            stamp = str(rows["t"][error.index]).strip()
-            advice = "; write dates as nanoseconds since 1970" if _DATE.match(stamp) else ""
-            raise RecordingError(
-                f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp[:40]!r}{advice}"
-            ) from None
+            text_ = not_a_stamp(str(rows["t"][error.index]))
+            raise RecordingError(f"{path}: row {error.index + 1} of the data: {text_}") from None
         self._note_stamps(sensor, column.sigma_s, column.report)
         if back_s := set_back_s(column.t_ns):
             self.set_back_s[sensor] = back_s

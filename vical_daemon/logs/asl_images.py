@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,14 +13,13 @@ from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hosti
 from vical_daemon.logs.asl_tables import read_table
 from vical_daemon.logs.encoded_size import HEAD, encoded_size
 from vical_daemon.logs.model import RecordingError
+from vical_daemon.logs.stamps import date_ns, stamp_in_name
 
 IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"} | {
     f".{kind}": kind for kind in ("pgm", "ppm", "bmp")
 }
 _OTHER_SUFFIXES = {".tif", ".tiff", ".webp", ".gif", ".jp2", ".exr", ".heic", ".raw", ".npy"}
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
-_STAMP_DIGITS = 13
-"""Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 _MOST = 0.9  # share of the names that are stamps; the others do not belong to the recording
 _TIMES = ("times.txt", "timestamps.txt", "*timestamps.txt", "*timestamps.csv")
 """Also `frame_timestamps.txt` (MARS logger) and `VID_..._timestamps.csv` (OpenCamera Sensors)."""
@@ -53,7 +53,7 @@ def image_list(table: Path, folder: Path) -> Images:
             continue
         stamp, _, name = (part.strip() for part in line.partition(","))
         name = name.split(",")[0].strip() or stamp
-        if not _NUMBER.fullmatch(stamp) or ".." in Path(name).parts or Path(name).is_absolute():
+        if not _is_stamp(stamp) or ".." in Path(name).parts or Path(name).is_absolute():
             raise RecordingError(
                 f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
             )
@@ -80,24 +80,26 @@ def _find(folder: Path, name: str) -> Path | None:
 def images_by_name(folder: Path) -> Images:
     """Return the images of a folder without ``data.csv``; none where they have no stamps.
 
-    Kalibr's `kalibr_bagcreater` reads such folders (ns); names like ``1305031102.175304`` are seconds.
-    Images that are merely numbered have their stamps in ``times.txt``, a line for each, or none.
+    Kalibr's `kalibr_bagcreater` reads such folders (ns); names like ``1305031102.175304`` are seconds, and
+    names may hold dates. Images that are merely numbered have their stamps in ``times.txt``, a line for each,
+    or none.
     """
     images = _in_order(folder, set(IMAGE_SUFFIXES))
-    stamped = [path for path in images if _is_stamp(path.stem)]
-    if images and len(stamped) >= _MOST * len(images):
-        rest = [path.name for path in images if not _is_stamp(path.stem)]
+    named = {path: stamp for path in images if (stamp := stamp_in_name(path.stem))}
+    stamped = list(named)
+    if images and len(named) >= _MOST * len(images) and not _counts(list(named.values())):
+        rest = [path.name for path in images if path not in named]
         text = f"{len(rest)} images left out, whose names are no stamps, first {rest[:1]}"
-        return Images([path.stem for path in stamped], stamped, [text] if rest else [])
+        return Images(list(named.values()), stamped, [text] if rest else [])
     stamps = _times_of(folder, images)
     if stamps or not images:
         unread = _in_order(folder, _OTHER_SUFFIXES)
         text = f"{len(unread)} unreadable images, like {{}}: only png, jpg, pgm, ppm and bmp are read"
         return Images(stamps, images, [text.format(unread[0].name)] if unread and not images else [])
-    other = next(path for path in images if path not in stamped)
+    other = next((path for path in images if path not in stamped), images[0])
     text = (
         f"{len(images)} images have no stamps: there is no data.csv, nor a times.txt with as many lines, and "
-        f"names like {other.name} are no times in ns"
+        f"names like {other.name} are no times in ns, nor dates to 1 ms"
     )
     return Images([], images, [text])
 
@@ -116,7 +118,7 @@ def _times_of(folder: Path, images: list[Path]) -> list[str]:
         return []
     named = all(len(row) > 1 and Path(row[0]).stem == p.stem for row, p in zip(rows, images, strict=True))
     stamps = [row[1 if named else 0] for row in rows]
-    return stamps if all(_NUMBER.fullmatch(stamp) for stamp in stamps) else []
+    return stamps if all(map(_is_stamp, stamps)) else []
 
 
 def _in_order(folder: Path, suffixes: set[str]) -> list[Path]:
@@ -131,8 +133,14 @@ def _counted(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _is_stamp(name: str) -> bool:
-    return len(name) >= _STAMP_DIGITS and re.fullmatch(r"[0-9]+(\.[0-9]+)?", name) is not None
+def _is_stamp(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None or date_ns(text) is not None
+
+
+def _counts(stamps: list[str]) -> bool:
+    """Whether what looks like stamps is a counter behind one date: 20260131_120000_001, _002 ..."""
+    digits = [int(re.sub(r"\D", "", stamp)) for stamp in stamps]
+    return len(digits) > 1 and all(b - a == 1 for a, b in pairwise(digits))
 
 
 def image_size(folder: Path) -> tuple[int, int] | None:

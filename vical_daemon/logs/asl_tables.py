@@ -17,9 +17,13 @@ import numpy.typing as npt
 from vical_drivers.user_files import open_file, read_file
 
 from vical_daemon.logs.model import RecordingError
+from vical_daemon.logs.stamps import date_ns
 
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
-_SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
+_ROW = re.compile(rb"^[ \t]*[-+]?\.?\d[^\r\n]*", re.MULTILINE)
+SPACED_DATE = re.compile(rb"(\d{4}-\d\d-\d\d) +(?=\d\d:\d\d)")
+_SPACED_UNIT = re.compile(rb" *(\[[^\]]*\]|\([^)]*\))")
+_HEAD_BYTES = 4096  # title and first rows
 _MISSING = frozenset({b"", b"na", b"n/a", b"null", b"none", b"-"})
 _FIRST_NUMBERS = 20  # of these one stamp in seconds is not a whole one
 _ROWS_LOOKED_AT = 20_000  # twenty images of 1000 points
@@ -104,13 +108,15 @@ def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
     count = columns_of(dtype)
     for number, line in _data_lines(text, begin):
         cells = [cell.strip() for cell in line.split(b",")]
-        if len(cells) >= count and all(_NUMBER_BYTES.fullmatch(cell) for cell in cells[:count]):
+        dated = date_ns(cells[0].decode("utf-8", "replace")) is not None
+        if len(cells) >= count and all(_NUMBER_BYTES.fullmatch(cell) for cell in cells[dated:count]):
             continue
         found = line.strip()[:60].decode("utf-8", "replace")
         found = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in found)
-        other = next((name for mark, name in _SEPARATORS.items() if line.count(mark) >= count - 1), "")
-        hint = f", separated by {other}; separate them by commas, with points in the numbers" if other else ""
-        if not hint and 4 <= len(cells) < count and count == _IMU_COLUMNS:
+        hint = ""
+        if b"," in line and len(line.split()) >= count:
+            hint = ", separated by spaces; write points in the numbers, not commas"
+        elif 4 <= len(cells) < count and count == _IMU_COLUMNS:
             hint = " (gyro and accelerometer in two tables? give the folder that holds both)"
         return f"line {number} is not {count} numbers{hint}: {found!r}"
     return "a stamp or an id is no integer, or too large"
@@ -138,11 +144,11 @@ def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _fractional(text: bytes, begin: int, column: int) -> bool:
-    """Whether one of the first numbers of a column is written with a point or an exponent (0, 0.005, ...)."""
+    """Whether one of the first numbers of a column is a fraction (0, 0.005, ...; or 1e9), or a date."""
     seen = set[bytes]()  # all points of an image have one stamp
     for _, line in islice(_data_lines(text, begin), _ROWS_LOOKED_AT):
         cell = (line.split(b",") + [b""] * column)[column].strip().lower()
-        if b"." in cell or b"e" in cell:
+        if b"." in cell or b"e" in cell or b":" in cell:
             return True
         seen.add(cell)
         if len(seen) > _FIRST_NUMBERS:
@@ -157,13 +163,19 @@ def columns_of(dtype: np.dtype[Any]) -> int:
 
 
 def read_table(path: Path) -> bytes:
-    """Read a table, packed or not.
+    """Read a table, packed or not, with commas between the cells, points in the numbers and T in dates.
+
+    Args:
+        path: Of a file; or of a folder with a file for each reading (`_joined`).
 
     Raises:
         RecordingError: It cannot be read, or is empty or too large.
     """
     try:
-        text = _unpacked(path) if path.suffix == ".gz" else read_file(path, TABLE_LIMIT)
+        if path.is_dir():
+            text = _joined(path)
+        else:
+            text = _unpacked(path) if path.suffix == ".gz" else read_file(path, TABLE_LIMIT)
     except (EOFError, zlib.error, gzip.BadGzipFile):
         raise RecordingError(f"{path} is no sound gzip file; unpack or download it again") from None
     except OSError as error:
@@ -173,7 +185,60 @@ def read_table(path: Path) -> bytes:
     text = text.removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in text:
         text = text.replace(b"\r", b"\n")  # lines as old programs on a Macintosh end them
-    return text.replace(b'"', b"")  # some programs put every cell between quotes
+    return with_commas(text.replace(b'"', b""))  # some programs put every cell between quotes
+
+
+def with_commas(text: bytes) -> bytes:
+    """Return a table with commas between its cells, points in its numbers, and T in its dates.
+
+    Its first row tells how it was written: cells between semicolons or tabs may have decimal commas.
+    """
+    first = _ROW.search(text)
+    row = first[0].strip() if first else b""
+    if SPACED_DATE.search(row):
+        text, row = (SPACED_DATE.sub(rb"\1T", part) for part in (text, row))
+    for mark in (b";", b"\t"):
+        if mark in row.strip(b";") and b"," + mark not in row:
+            return text.translate(bytes.maketrans(b"," + mark, b".,"))
+    if b"," in row or not row.split()[1:]:
+        return text
+    begin = _ROW.search(text).start()  # type: ignore[union-attr]
+    title = _title_with_commas(text[:begin], len(row.split()))
+    return title + re.sub(rb"(?<=\S)[ \t]+(?=[^\s])", b",", text[begin:])
+
+
+def _title_with_commas(text: bytes, count: int) -> bytes:
+    """Return lines above rows of so many cells between spaces; without names where their number differs."""
+    lines = text.splitlines()
+    plain = _SPACED_UNIT.sub(lambda unit: unit[1].replace(b" ", b""), lines[-1] if lines else b"")
+    names = plain.strip(b"#% \t").split()
+    title = b"#" + b",".join(names if len(names) == count else [])
+    return b"\n".join([title, *[b"#"] * (len(lines) - 1), b""]) if lines else b""
+
+
+def _joined(folder: Path) -> bytes:
+    """Return one table of a folder with one file for each reading, as KITTI's `oxts`.
+
+    ``timestamps.txt`` has a line for each file of ``data/``, which are named by its number, from 0;
+    ``dataformat.txt`` one for each column, which begins with its name.
+
+    Raises:
+        OSError: A file cannot be read.
+        RecordingError: Files have no stamps.
+    """
+    stamps = read_file(folder / "timestamps.txt", TABLE_LIMIT).splitlines()
+    files = {int(p.stem): p for p in sorted((folder / "data").glob("*.txt")) if p.stem.isdecimal()}
+    if not files or max(files) >= len(stamps):
+        raise RecordingError(
+            f"{folder}: {len(files)} files in data/, but {len(stamps)} lines in timestamps.txt; copy it again"
+        )
+    names = [
+        line.split(b":")[0].strip()
+        for line in read_file(folder / "dataformat.txt", _SMALL).splitlines()
+        if b":" in line
+    ]
+    rows = [b" ".join([stamps[i].strip(), *read_file(p, _SMALL).split()]) for i, p in files.items()]
+    return b"\n".join([b" ".join([b"timestamp", *names]), *rows])
 
 
 def _unpacked(path: Path) -> bytes:
@@ -209,10 +274,31 @@ def _first_data_row(text: bytes) -> int:
 def imu_tables(root: Path) -> dict[str, Path]:
     """Return the tables of inertial readings of a folder by the names of the IMUs, in order of these.
 
-    ``imu0/data.csv`` (ASL) or ``imu0.csv`` (Kalibr's `kalibr_bagcreater`; also ``imu.csv``), or packed.
+    ``imu0/data.csv`` (ASL) or ``imu0.csv`` (Kalibr's `kalibr_bagcreater`; also ``imu.txt``), or packed; the
+    folder ``oxts`` of KITTI.
     """
-    beside = sorted(root.glob("imu*.csv.gz")) + sorted(root.glob("imu*.csv"))
-    found = {p.name.split(".")[0]: p for p in beside if re.fullmatch(r"imu[0-9]*\.csv(\.gz)?", p.name)}
+    beside = [p for p in sorted(root.glob("imu*"), reverse=True) if is_table(p)]
+    found = {p.name.split(".")[0]: p for p in beside if re.fullmatch(r"imu[0-9]*\..*", p.name)}
     for name in ("data.csv.gz", "data.csv"):
         found |= {p.parent.name: p for p in root.glob(f"imu*/{name}")}
+    found |= {p.parent.name: p.parent for p in root.glob("oxts/dataformat.txt")}
     return dict(sorted(found.items()))
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file may be a table of readings: by its name; of a text, its first row tells."""
+    name = path.name.lower()
+    if name.endswith((".csv", ".csv.gz")):
+        return path.is_file()
+    return name.endswith((".txt", ".tsv")) and path.is_file() and title_of(path)[1].count(b",") > 2
+
+
+def title_of(path: Path) -> tuple[bytes, bytes]:
+    """Return the first line of a table that is not packed, and its first row, both with commas."""
+    try:
+        with open_file(path) as file:
+            head = with_commas(file.read(_HEAD_BYTES).replace(b'"', b""))
+    except OSError:
+        return b"", b""  # it is named when it is read
+    row = _ROW.search(head)
+    return head.split(b"\n", 1)[0], row[0] if row else b""

@@ -87,7 +87,8 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     if rate_hz < _SLOWEST_IMU_HZ:
         raise RecordingError(
             f"{name}: {rate_hz:.3g} samples a second by its stamps; an IMU needs {_SLOWEST_IMU_HZ:g} Hz and "
-            "more: are the stamps nanoseconds, and is this the IMU's file?"
+            "more: are the stamps nanoseconds, and is this the IMU's file? (KITTI: of synced recordings it "
+            "is thinned out; take the unsynced one, ..._extract, with 100 Hz)"
         )
     return rate_hz
 
@@ -276,7 +277,7 @@ def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
         apart_s = (stream.begin_ns - begin) * 1e-9
         raise RecordingError(
             f"{stream.name}: its stamps and the IMU's do not overlap (they begin {apart_s:.6g} s apart); "
-            "both must come from one clock"
+            "both must come from one clock (and dates from one time zone)"
         )
     outside_s = stream.duration_s - overlap_s
     if outside_s > 1.0:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from calendar import timegm
 from collections.abc import Iterable
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -14,6 +16,18 @@ FACTOR_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 UNIT_WORDS = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 _NAMED = {"ns": "ns", "nsec": "ns", "us": "us", "µs": "us", "usec": "us", "ms": "ms", "msec": "ms"}
 _NAMED |= {"s": "s", "sec": "s"} | {word: unit for unit, word in UNIT_WORDS.items()}
+_DATE = re.compile(
+    r"((?:19|20)\d\d-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d)(?:[.,](\d+))? *([Zz]|UTC|[+-]\d\d(?::?\d\d)?)?", re.ASCII
+)
+_NAMED_DATE = re.compile(
+    r"(?:.*?\D)?((?:19|20)\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]*(\d\d)([-_.:]?)(\d\d)\6(\d\d)[-_.,]*"
+    r"(\d{9}|\d{6}|\d{3})(?:\D.*)?",
+    re.ASCII,
+)
+"""A date in a file's name: year, month, day, hour, minute, second, and a fraction of ms, us or ns."""
+_NAMED_STAMP = re.compile(r"\d{13,}(?:\.\d+)?|\d{10,}\.\d+", re.ASCII)
+"""In a file's name: UNIX time has 13 digits in ms, 16 in us, 19 in ns; 10 in s, with a fraction."""
+_UNIX_DIGITS = (13, 16, 19)
 _LATEST_NS = 4_102_444_800 * FACTOR_NS["s"]  # the year 2100: no stamp lies behind it
 _APART_NS = 600 * FACTOR_NS["s"]
 """From the other stamps of a recording: ten minutes, longer than anyone rests within one."""
@@ -32,16 +46,21 @@ class StampError(ValueError):
 
 
 def numbers(texts: Iterable[str]) -> list[int] | list[Decimal]:
-    """Read stamps exactly: as integers where all are, else as decimal fractions.
+    """Read stamps exactly: as integers where all are, as dates (in ns), else as decimal fractions.
 
     Raises:
-        StampError: One is no finite number.
+        StampError: One is no finite number; among dates, no date.
     """
     texts = list(texts)
     try:
         return [int(text) for text in texts]
     except ValueError:
         pass
+    if date_ns(texts[0]) is not None:
+        dates = [date_ns(text) for text in texts]
+        if None in dates:
+            raise StampError(dates.index(None))
+        return [date for date in dates if date is not None]
     values = []
     for i, text in enumerate(texts):
         try:
@@ -52,6 +71,48 @@ def numbers(texts: Iterable[str]) -> list[int] | list[Decimal]:
             raise StampError(i)
         values.append(value)
     return values
+
+
+def date_ns(text: str) -> int | None:
+    """Read a date of ISO 8601 with its time of day as UNIX time, ns; without a zone as UTC; None: it is none.
+
+    >>> date_ns("1970-01-01T01:00:00.000000001+01:00"), date_ns("1970-01-01 00:00:01.5"), date_ns("1.5")
+    (1, 1500000000, None)
+    """
+    match = _DATE.fullmatch(text.strip())
+    if match is None:
+        return None
+    try:
+        seconds = timegm(datetime.fromisoformat(match[1].upper()).timetuple())
+    except ValueError:
+        return None  # the 31st of February
+    zone = re.sub(r"[A-Za-z:]", "", match[3] or "")
+    if zone:
+        seconds -= int(zone[0] + "1") * (3600 * int(zone[1:3]) + 60 * int(zone[3:] or 0))
+    return seconds * FACTOR_NS["s"] + int((match[2] or "0")[:9].ljust(9, "0"))
+
+
+def stamp_in_name(name: str) -> str:
+    """Return the stamp that a file's name (without its ending) holds: a number or a date; empty: none.
+
+    >>> stamp_in_name("left_1403636579763555584"), stamp_in_name("20260131_120000_250"), stamp_in_name("0012")
+    ('1403636579763555584', '2026-01-31T12:00:00.250', '')
+    """
+    found = _NAMED_STAMP.findall(name)
+    if match := _NAMED_DATE.fullmatch(name):
+        year, _, month, day, hour, _, minute, second, fraction = match.groups()
+        date = f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction}"
+        if date_ns(date) is not None and not (found and len(found[0]) in _UNIX_DIGITS):
+            return date
+    return found[0] if len(found) == 1 else ""
+
+
+def not_a_stamp(text: str) -> str:
+    """Say that a stamp cannot be read, and of dates how they are written."""
+    text = text.strip()[:40]
+    dated = re.search(r"\d[-:/.]\d+[-:/.]\d", text)
+    advice = "; write dates like 2026-01-31T12:00:00.123 (ISO 8601), or as ns since 1970" if dated else ""
+    return f"its stamp is no number: {text!r}{advice}"
 
 
 def to_ns(values: list[int] | list[Decimal], unit: str) -> IntArray:

@@ -14,7 +14,7 @@ import numpy as np
 from vical_drivers.user_files import read_file
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl_tables import TABLE_LIMIT
+from vical_daemon.logs.asl_tables import SPACED_DATE, TABLE_LIMIT
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamps import (
     UNIT_WORDS,
@@ -68,7 +68,7 @@ def read_trajectory(path: Path) -> Trajectory:
     titles, rows, warnings = _rows(path)
     if not rows:
         raise RecordingError(f"{path}: 0 poses; expected {_EXPECTED}")
-    comma = "," in rows[0][1]
+    comma = "," in rows[0][1] and ";" not in rows[0][1]
     cells = [_cells(text) for _, text in rows]
     layout = _named(path, titles, len(cells[0])) or _plain(path, cells, comma)
     needed = max(*layout.quaternion, layout.stamp) + 1
@@ -108,7 +108,7 @@ def _rows(path: Path) -> tuple[list[str], list[tuple[int, str]], list[str]]:
     data = read_file(path, TABLE_LIMIT)
     if b"\0" in data:
         raise RecordingError(f"{path}: no text, so no trajectory; expected {_EXPECTED}")
-    text = data.decode("utf-8-sig", "replace")
+    text = SPACED_DATE.sub(rb"\1T", data).decode("utf-8-sig", "replace")
     for number, line in enumerate(text.splitlines(), 1):
         text = line.strip()
         if not text:
@@ -123,13 +123,15 @@ def _rows(path: Path) -> tuple[list[str], list[tuple[int, str]], list[str]]:
 
 
 def _cells(text: str) -> list[str]:
+    text = text.replace(",", ".") if ";" in text else text  # decimal commas
     separator = next((s for s in ",;" if s in text), None)
     return [cell.strip() for cell in text.rstrip(",; ").split(separator)]
 
 
 def _is_row(cells: list[str], layout: _Layout) -> bool:
     try:
-        [float(cells[k]) for k in (layout.stamp, *layout.quaternion)]
+        numbers([cells[layout.stamp]])
+        [float(cells[k]) for k in layout.quaternion]
     except ValueError:
         return False
     return True

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from vical_drivers.user_files import open_file
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl_tables import load_table, read_table
+from vical_daemon.logs.asl_tables import is_table, load_table, read_table, title_of
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamp_column import column_ns
-from vical_daemon.logs.stamps import StampError, numbers
+from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers
 from vical_daemon.logs.titled_columns import (
     IN_DEGREES,
     axes_by_title,
@@ -30,7 +29,6 @@ _GYRO, _ACCEL = re.compile(r"gyr"), re.compile(r"acc")
 _DERIVED = re.compile(r"uncal|gravity|linear|user|mag|bias")
 """In the name of a table: made from others by the phone, or without its calibration."""
 _ROW = np.dtype([("t", "<i8"), ("axes", "<f8", (3,))])
-_TITLE_BYTES = 4096
 _EXPECTED = "a stamp and 3 axes"
 
 
@@ -57,20 +55,15 @@ def two_tables(root: Path) -> tuple[Path, Path] | None:
     `Accelerometer.csv`.
     """
     places = (root, root / "imu0")
-    tables = [p for place in places if place.is_dir() for p in sorted(place.glob("*.csv*"))]
-    tables = [p for p in tables if p.name.lower().endswith((".csv", ".csv.gz"))]
+    tables = [p for place in places if place.is_dir() for p in sorted(place.iterdir()) if is_table(p)]
     gyro, accel = (_named(tables, *x) for x in ((_GYRO, _ACCEL), (_ACCEL, _GYRO)))
     return None if gyro is None or accel is None else (gyro, accel)
 
 
 def one_table(root: Path) -> Path | None:
     """Return the one table of a folder whose title names all six axes; None: there is none, or several."""
-    found = []
-    for path in sorted(root.glob("*.csv")):
-        with open_file(path) as file:
-            title = file.readline(_TITLE_BYTES).decode("utf-8", "replace")
-        if columns_by_title(title) is not None:
-            found.append(path)
+    tables = sorted(p for p in root.iterdir() if is_table(p) and p.suffix != ".gz")
+    found = [p for p in tables if columns_by_title(title_of(p)[0].decode("utf-8", "replace")) is not None]
     return found[0] if len(found) == 1 else None
 
 
@@ -103,9 +96,8 @@ def read_sensor(path: Path) -> SensorTable:
         stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
         column = column_ns(stamps, title, imu=True)
     except StampError as error:
-        stamp = str(rows["t"][error.index]).strip()[:40]
-        text_ = f"{path}: row {error.index + 1} of the data: its stamp is no number: {stamp!r}"
-        raise RecordingError(text_) from None
+        text_ = not_a_stamp(str(rows["t"][error.index]))
+        raise RecordingError(f"{path}: row {error.index + 1} of the data: {text_}") from None
     good = np.isfinite(rows["axes"]).all(axis=1)
     return SensorTable(column.t_ns[good], rows["axes"][good], column.report, column.sigma_s)
 

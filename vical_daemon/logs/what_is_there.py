@@ -11,6 +11,7 @@ from vical_daemon.logs.asl_images import IMAGE_SUFFIXES
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".h264", ".h265", ".svo", ".svo2"})
 FROM_VIDEO = "a video is not read: extract its images into cam0/, named by their stamps in ns"
 _TABLES = frozenset({".csv", ".txt", ".tsv", ".json"})
+_OF_RECORDINGS = frozenset({"mav0", "oxts"})  # folders: ASL, KITTI
 _LOGS = frozenset({".mcap", ".bag", ".db3"})
 _LOOKED_AT = 200  # entries of a folder; what is in it shows in the first ones
 _NAMED = 4  # in a message of one line
@@ -23,7 +24,9 @@ def what_is_there(folder: Path) -> str:
         folder: That was given.
     """
     entries = _entries(folder)
-    recordings = [e.name for e in entries if any(x.name == "mav0" or x.suffix in _LOGS for x in _entries(e))]
+    recordings = [
+        e.name for e in entries if any(x.name in _OF_RECORDINGS or x.suffix in _LOGS for x in _entries(e))
+    ]
     if recordings:
         return f"; found recordings in it: give one of {_listed(recordings)}"
     tables = [e.name for e in entries if e.suffix.lower() in _TABLES]

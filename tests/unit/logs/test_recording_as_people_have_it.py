@@ -264,13 +264,13 @@ def test_a_stamp_that_is_no_number_is_named(tmp_path, write_asl):
         open_recording(folder)
 
 
-def test_dates_for_stamps_are_shown_with_what_to_write(tmp_path, write_asl):
+def test_dates_of_another_form_are_shown_with_what_to_write(tmp_path, write_asl):
     folder = write_asl(tmp_path / "a")
     path = folder / "mav0/imu0/data.csv"
     title, *rows = path.read_text().splitlines()
-    dated = [f"2026-11-27T09:00:{k / 100:09.6f}Z{row[row.index(',') :]}" for k, row in enumerate(rows)]
+    dated = [f"27.11.2026 09:00:{k / 100:09.6f}{row[row.index(',') :]}" for k, row in enumerate(rows)]
     path.write_text("\n".join([title, *dated]) + "\n")
-    shown = r"row 1 .* no number: '2026-11-27T09:00:00.000000Z'; write dates as nanoseconds since 1970$"
+    shown = r"row 1 .* no number: '27.11.2026 09:00:00.000000'; write dates like 2026-01-31T12:00:00.123"
     with pytest.raises(RecordingError, match=shown):
         open_recording(folder)
 
@@ -286,8 +286,10 @@ def _rewritten(folder, change, table="mav0/imu0/data.csv"):
     ("change", "message"),
     [
         (lambda lines: lines[:1], "no data below its title"),
-        (lambda lines: [line.replace(",", ";") for line in lines], "separated by semicolons"),
-        (lambda lines: [line.replace(",", "\t") for line in lines], "separated by tabs"),
+        (
+            lambda lines: [line.replace(",", " ").replace(".", ",") for line in lines],
+            "separated by spaces; write points in the numbers",
+        ),
         (lambda lines: [*lines[:40], "hello,world", *lines[40:]], "line 41 is not 7 numbers: 'hello,world'"),
         (lambda lines: [line.rsplit(",", 3)[0] for line in lines], "line 2 is not 7 numbers"),
     ],
