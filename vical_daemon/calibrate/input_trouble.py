@@ -63,6 +63,7 @@ class InputTrouble:
         for name, rate_hz in camera_rates_hz.items():
             self._devices[f"camera/{name}"] = _Device(max(FRESH_S, _PERIODS / rate_hz))
         self._said: dict[str, str] = {}  # what is wrong with a device or its detector, by name
+        self._refused: dict[str, str] = {}  # why the last message that came cannot be true
         self._wrong_target: dict[str, str] = {}  # what images contradict in the target file, by camera
         self._looks_for: dict[str, str] = {}  # the board that was found in no image, by camera
         self._looked_s: float | None = None
@@ -70,6 +71,10 @@ class InputTrouble:
     def imu_came(self, *, new: bool) -> None:
         """Readings came; `new`: not only the same one again."""
         self._came(self._imu, new=new)
+
+    def imu_refused(self, why: str) -> None:
+        """A reading came that no device measures; `why`: one line."""
+        self._refused[self._imu] = f"its readings are refused: {why}"
 
     def image_came(self, camera: str, *, new: bool) -> None:
         """What was found in an image came; `new`: not the same as in the one before, to the last bit."""
@@ -82,6 +87,7 @@ class InputTrouble:
         device.repeats = not new
         if new:
             device.age_s, device.ever = 0.0, True
+            self._refused.pop(name, None)
 
     def take(self, message: DiagnosticsMessage) -> None:
         """Take what a role says of its devices."""
@@ -142,7 +148,7 @@ class InputTrouble:
         line = f"nothing from {short} {since}"
         if device.repeats:
             line = f"nothing new from {short} {since}: it delivers the same again and again"
-        why = self._said.get(name) or self._said.get(f"detect/{short}", "")
+        why = self._refused.get(name) or self._said.get(name) or self._said.get(f"detect/{short}", "")
         return f"{line}: {why}" if why else line
 
     def of_camera(self, camera: str) -> str:

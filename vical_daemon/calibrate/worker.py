@@ -103,8 +103,10 @@ class EstimateRole:
                 self.images += 1
                 frame = admit_points(sample.payload).to_frame()
                 self._sort_in(sample.key, frame.t_cam_ns, frame)
-        except ImplausibleError:
+        except ImplausibleError as error:
             self._implausible += 1
+            if sample.key == self._imu_key:
+                self._trouble.imu_refused(str(error))
         except MessageError:
             self._malformed += 1
 

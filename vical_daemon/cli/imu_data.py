@@ -60,8 +60,8 @@ def load(args: argparse.Namespace) -> EvenSamples:
         raise CliError(
             f"{path}: only {np.count_nonzero(use)} samples after --skip and --seconds, 100 are needed"
         )
+    from vical_daemon.estimation.inertial.units import ImuArrays
     from vical_daemon.logs.checks import check_imu
-    from vical_daemon.logs.model import ImuArrays
 
     check_imu(name, ImuArrays(t_ns[use], gyro[use], accel[use]))  # units: g and deg/s are refused by name
     samples = even_grid(name, t_ns[use], gyro[use], accel[use])

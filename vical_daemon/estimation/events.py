@@ -37,6 +37,7 @@ class EventKind(StrEnum):
     IMU_GAP = "imu_gap"
     IMU_REPEATED = "imu_repeated"
     IMU_CLIPPED = "imu_clipped"
+    IMU_UNITS = "imu_units"
     IMAGE_GAP = "image_gap"
     IMAGE_REPEATED = "image_repeated"
     IMAGES_WANDER = "images_wander"
@@ -116,8 +117,10 @@ class Event:
         return self.kind in _CHANGES
 
 
-SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
-"""Kinds whose details (serial numbers, a line of code) are text only."""
+SAID = frozenset(
+    {EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED, EventKind.IMU_UNITS}
+)
+"""Kinds whose details (serial numbers, a line of code, a unit) are text only."""
 ROLLING = {"rows": EventKind.ROLLING_SHUTTER, "columns": EventKind.ROLLING_COLUMNS}
 """What is announced of a rolling shutter, by `CameraPrior.readout_axis`."""
 _CHANGES = frozenset(

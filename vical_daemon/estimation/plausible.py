@@ -37,11 +37,13 @@ def imu_problem(gyro_rps: Sequence[float], specific_force_mps2: Sequence[float])
     """Say why this cannot be an inertial reading (rad/s, m/s^2); empty: it can."""
     x, y, z = gyro_rps  # written out: for each reading, and a loop takes three times as long
     if not (abs(x) <= MOST_RPS and abs(y) <= MOST_RPS and abs(z) <= MOST_RPS):  # false for NaN, too
-        return f"a rate of {_worst(gyro_rps):.3g} rad/s where no gyro reads more than {MOST_RPS:.0f}"
+        worst = _worst(gyro_rps)
+        return f"a rate of {worst:.3g} rad/s where no gyro reads more than {MOST_RPS:.0f}; is it in deg/s?"
     x, y, z = specific_force_mps2
     if not (abs(x) <= MOST_MPS2 and abs(y) <= MOST_MPS2 and abs(z) <= MOST_MPS2):
         worst = _worst(specific_force_mps2)
-        return f"a force of {worst:.3g} m/s^2 where no accelerometer reads more than {MOST_MPS2:.0f}"
+        most = f"{MOST_MPS2:.0f}; is it in mg?"
+        return f"a force of {worst:.3g} m/s^2 where no accelerometer reads more than {most}"
     return ""
 
 

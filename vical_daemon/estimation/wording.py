@@ -409,6 +409,7 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     EventKind.ROLLING_COLUMNS: _rolling,
     EventKind.LENS_TERM_MISSING: "the lens needs one more term than radtan has: set "
     "distortion_model: plumb_bob",
+    EventKind.IMU_UNITS: lambda e: e.said,
     EventKind.DEVICE_REPLACED: lambda e: e.said,
     EventKind.ESTIMATOR_RESTARTED: lambda e: e.said,
     EventKind.OTHER: lambda e: e.said,

@@ -13,12 +13,13 @@ from pathlib import Path
 from vical_drivers.user_files import read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES
+from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.asl_tables import is_table
 from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
-from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream, meant
+from vical_daemon.logs.model import Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
 from vical_daemon.logs.what_is_there import FROM_VIDEO, VIDEOS, what_is_there
 

@@ -16,6 +16,7 @@ from vical_drivers.user_files import read_file
 
 from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encode_points
 from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
+from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.estimation.measurements import IntArray
 from vical_daemon.logs.asl_images import IMAGE_SUFFIXES, Images, image_list, image_size, images_by_name
 from vical_daemon.logs.asl_tables import (
@@ -29,7 +30,6 @@ from vical_daemon.logs.checks import take_turns
 from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.model import (
-    ImuArrays,
     Kind,
     Recording,
     RecordingError,

@@ -13,7 +13,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from vical_daemon.bus.messages import decode_imu, decode_points
-from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.inertial.units import ImuArrays
+from vical_daemon.estimation.measurements import IntArray, PointsFrame
 
 Kind = Literal["imu", "image", "compressed", "points", "tracks"]
 # Preferred stream of a camera that has several: points before images.
@@ -76,15 +77,6 @@ class Stream:
     def duration_s(self) -> float:
         """From the first stamp to the last."""
         return (self.end_ns - self.begin_ns) * 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class ImuArrays:
-    """All samples of one imu: stamps (n,) ns, rates (n, 3) rad/s, specific forces (n, 3) m/s^2."""
-
-    t_ns: IntArray
-    gyro_rps: FloatArray
-    specific_force_mps2: FloatArray
 
 
 class Recording(ABC):

@@ -23,12 +23,12 @@ from vical_daemon.bus.messages import (
     decode_image,
 )
 from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
+from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.logs.channel import Channel, UsedMessages, frame_of, stamp_of, with_force, with_stamp
 from vical_daemon.logs.even_images import CameraStamps, PointReader
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogMessage, LogReader, segments_in, size_now
 from vical_daemon.logs.model import (
-    ImuArrays,
     Kind,
     OutOfReach,
     Recording,

@@ -7,13 +7,13 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from vical_daemon.config.priors import Initial
+from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.estimation.measurements import ROWS
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.tools.observability import Motion, Setup
 from vical_daemon.logs import Recording
-from vical_daemon.logs.model import ImuArrays
 from vical_daemon.offline.calibrate import run_job
 from vical_daemon.offline.calibration_job import make_job
 from vical_daemon.offline.errors import InputError

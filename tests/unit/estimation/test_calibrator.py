@@ -155,7 +155,7 @@ def test_still_rig_never_converges_and_says_why():
 def test_accelerometer_in_g_is_named(run):
     estimate = calibrate(run, force_scale=1 / 9.80665).estimate()
     assert estimate.status == Status.INCONSISTENT
-    assert "in g" in estimate.reason
+    assert "it looks like g" in estimate.reason
 
 
 @pytest.mark.parametrize(

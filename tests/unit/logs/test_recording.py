@@ -14,11 +14,11 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from vical_daemon.bus import messages as m
+from vical_daemon.estimation.inertial.units import ImuArrays, gyro_scale
 from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.channel import stamp_of, with_stamp
-from vical_daemon.logs.checks import gyro_scale
 from vical_daemon.logs.mcap import LogWriter
-from vical_daemon.logs.model import ImuArrays, Stamped, in_stamp_order
+from vical_daemon.logs.model import Stamped, in_stamp_order
 from vical_daemon.logs.summary import summarise_recording
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"

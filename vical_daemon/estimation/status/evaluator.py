@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import Guidance, WeakDirection
+from vical_daemon.estimation.inertial.units import ImuArrays, unit_mistake
 from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.unscented import RIDGE
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
@@ -36,7 +36,9 @@ PATIENCE_S = 15.0
 long a changed mounting or clock is looked for before anything may have changed."""
 LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
-_EVERY_READINGS = 16  # the size of one in so many is kept
+_KEPT_NS = 20_000_000  # a reading in so many ns is kept, by which units are checked: hands move up to 5 Hz
+_KEPT = 1000  # of these, 20 s
+_LEAST_NS = 5_000_000_000  # of readings, by which their unit is judged
 
 
 class Verdict(NamedTuple):
@@ -127,13 +129,13 @@ class Evaluator:
         self._events, self._steady = EventLog(), SteadyStatus()
         self._started_s: float | None = None
         self.bumped = Cause.NONE
-        self._size: deque[float] = deque(maxlen=400)
+        self._kept: deque[tuple[int, Sequence[float], Sequence[float]]] = deque(maxlen=_KEPT)
         self._squares: deque[tuple[float, int]] = deque(maxlen=squares)
         self._ever_converged = self.believed = False
         self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
 
     def saw_reading(self, t_ns: int, gyro: Sequence[float], accel: Sequence[float]) -> None:
-        """Count one inertial reading, and keep the size of some."""
+        """Count one inertial reading, and keep some."""
         if not self.imu_samples:
             self._first_ns = t_ns
         self.imu_samples += 1
@@ -141,8 +143,11 @@ class Evaluator:
         self._events.now_s = elapsed_s = self.elapsed_s
         self.motion.add(elapsed_s, gyro)
         self._readings.add(gyro, accel)
-        if self.imu_samples % _EVERY_READINGS == 1:
-            self._size.append(math.hypot(*accel))
+        since_ns = t_ns - self._kept[-1][0] if self._kept else _KEPT_NS
+        if since_ns < 0:  # the clock was set back
+            self._kept.clear()
+        if not self._ever_converged and not 0 <= since_ns < _KEPT_NS:
+            self._kept.append((t_ns, gyro, accel))
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points or tracks in it."""
@@ -236,9 +241,13 @@ class Evaluator:
         return self._published(verdict)
 
     def _published(self, verdict: Verdict) -> Verdict:
+        if mistake := self._unit_mistake():
+            verdict = Verdict(Status.INCONSISTENT, mistake)
+            self.announce(Event(EventKind.IMU_UNITS, said=mistake), once=EventKind.IMU_UNITS)
         reported = self._steady.follow(verdict, self.elapsed_s)
         if self.status == Status.CONVERGED:
             self._ever_converged = self.believed = True
+            self._kept.clear()
         return reported
 
     def _before_start(self) -> Verdict:
@@ -248,9 +257,6 @@ class Evaluator:
             return Verdict(Status.INCONSISTENT, why)
         if not self.imu_samples:
             return Verdict(Status.WAITING, "no inertial data yet")
-        trouble = self._unit_trouble()
-        if trouble:
-            return Verdict(Status.INCONSISTENT, trouble)
         if self.first_frame_s is None:
             return Verdict(Status.WAITING, self._nothing_seen)
         if self.motion_missing and self.elapsed_s - self.first_frame_s > PATIENCE_S:
@@ -258,13 +264,12 @@ class Evaluator:
             return Verdict(Status.DEGENERATE, self.reason, advice)
         return Verdict(Status.INITIALISING, self.reason or "collecting the first seconds")
 
-    def _unit_trouble(self) -> str:
-        size = float(np.median(self._size)) if len(self._size) >= 20 else 0.0
-        if 0.7 < size < 1.4:
-            return (
-                f"specific force has a median size of {size:.2f}: is the accelerometer in g instead of m/s^2?"
-            )
-        return ""
+    def _unit_mistake(self) -> str:
+        """Say what is wrong with units or columns of the latest readings; never once it has converged."""
+        if not self._kept or self._kept[-1][0] - self._kept[0][0] < _LEAST_NS:
+            return ""
+        t_ns, gyro, accel = zip(*self._kept, strict=True)
+        return unit_mistake(ImuArrays(np.array(t_ns), np.array(gyro), np.array(accel)))
 
     @staticmethod
     def _once_known(*, enough: bool, doubt: str, pause: str = "") -> Verdict:

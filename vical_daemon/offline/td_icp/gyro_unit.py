@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.units import ImuArrays, gyro_mistake
 from vical_daemon.estimation.temporal.td_icp_result import REFUSED, TdIcpResult
-from vical_daemon.logs.checks import gyro_mistake
-from vical_daemon.logs.model import ImuArrays
 
 FloatArray = npt.NDArray[np.float64]
 
