@@ -1,4 +1,4 @@
-"""An IMU in other units, or with its sensors in each other's place: a live user is told as one with a file is."""
+"""An IMU in other units, or with swapped sensors: a live user is told as one with a file is."""
 
 from __future__ import annotations
 
