@@ -64,7 +64,7 @@ def usual_rate_hz(t_ns: IntArray) -> float:
 
 
 def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
-    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
+    slow, gyro = np.percentile(np.linalg.norm(samples.gyro_rps, axis=1), [5, 50]).tolist()
     if gyro > _NO_GYRO:
         return (
             f"the gyro reads {gyro:.3g} in the middle, rad/s are expected; are these its columns, "
@@ -77,7 +77,9 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
     first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
     if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
         text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
-    elif (_LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro) or _swapped(samples, correlation):
+    elif (
+        _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro and slow > _GRAVITY_REMOVED * gyro
+    ) or _swapped(samples, correlation):
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
     elif constant := constant_channels(samples):
         text = constant
