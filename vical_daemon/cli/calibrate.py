@@ -55,7 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
     parser.add_argument(
         "--initial",
         metavar="FILE",
-        help="prior values, in the format of Kalibr's camchain and imu.yaml; every key is optional",
+        help="prior values, in the format of Kalibr's camchain and imu.yaml, both in one file; every key is "
+        "optional",
     )
     parser.add_argument(
         "--fix",

@@ -8,7 +8,7 @@ import shutil
 import sys
 import textwrap
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 
@@ -57,8 +57,30 @@ def fit(text: str, width: int) -> str:
     return "\n".join(lines).strip("\n")
 
 
+class _Once(argparse.Action):
+    """Stores a value; a second, other one is refused: argparse would silently take the last."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Take one value."""
+        before = getattr(namespace, self.dest, self.default)
+        if option_string and before is not self.default and before != values:
+            parser.error(f"{option_string} is given twice, with {before} and {values}; give it once")
+        setattr(namespace, self.dest, values)
+
+
 class VicalParser(argparse.ArgumentParser):
     """An argument parser whose errors are one line and name the help to read."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for name in (None, "store"):
+            self.register("action", name, _Once)
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit 2."""

@@ -92,7 +92,7 @@ def parse(text: str, name: str) -> Document:
         ConfigError: Not YAML, or YAML that this module refuses.
     """
     document = Document(name)
-    text = text.removeprefix("%YAML:1.0")  # OpenCV's first line, as in OpenVINS's files: no directive of YAML
+    text = text.replace("%YAML:1.0", "# %YAML")  # OpenCV's first line, as in OpenVINS's: no directive of YAML
     try:
         refuse_hostile(text, name)
         node = yaml.compose(text, Loader=yaml.SafeLoader)

@@ -221,6 +221,8 @@ def _why_not(path: Path) -> str:
         return "is a pipe or a device: a recording is read more than once, copy it into a file"
     if path.suffix.lower() in VIDEOS:
         return f"is no recording: {FROM_VIDEO}, with imu0.csv next to it"
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return "is no recording: give a target with --target, Kalibr's camchain or imu.yaml with --initial"
     if path.suffix in _UNPACKERS:
         return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
     return f"is no recording: {_NEEDED}"

@@ -242,3 +242,20 @@ def test_help_fits_the_terminal(
     assert len(lines) > 5
     too_long = [line for line in lines if len(line) > columns]
     assert all(line.startswith("  vical ") for line in too_long), too_long  # examples, to be copied
+
+
+def test_an_option_given_twice_is_refused(capsys):
+    """The last one was taken silently: of Kalibr's camchain and imu.yaml, one of two cameras."""
+    words = ["calibrate", "a.mcap", "--initial", "camchain.yaml", "--initial", "imu.yaml"]
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+    line = capsys.readouterr().err
+    assert "--initial is given twice, with camchain.yaml and imu.yaml; give it once" in line
+    assert line.count("\n") == 1
+
+
+def test_an_option_given_twice_alike_is_taken(capsys):
+    assert cli.main(["info", "--json", "--json", "no_such.mcap"]) == 1
+    assert cli.main(["calibrate", "no_such.mcap", "--camera", "cam0", "--camera", "cam0"]) == 1
+    assert "no_such.mcap does not exist" in capsys.readouterr().err

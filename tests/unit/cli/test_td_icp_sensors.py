@@ -226,3 +226,20 @@ def test_what_is_no_orientation_is_said(tmp_path: Path, capsys: Any) -> None:
     assert len(empty.err.strip().splitlines()) == 1
     stranger = _td_icp(capsys, path, "imu0,radar")
     assert stranger.code == 2 and "radar" in stranger.err
+
+
+def test_a_second_recording_is_no_sensor(asl_folder, capsys):
+    """A folder's path begins with a slash, as topics do."""
+    assert main(["td-icp", str(asl_folder), str(asl_folder.parent)]) == 2
+    line = capsys.readouterr().err
+    assert f"one recording is taken, {asl_folder}; what follows it are its sensors" in line
+
+
+def test_a_target_file_in_place_of_the_recording_is_named(asl_folder, tmp_path, capsys):
+    (tmp_path / "target.yaml").write_text("target_type: checkerboard\n")
+    for words in (
+        ["td-icp", str(tmp_path / "target.yaml"), str(asl_folder)],
+        ["calibrate", str(tmp_path / "target.yaml")],
+    ):
+        assert main(words) == 1
+        assert "target.yaml is no recording: give a target with --target" in capsys.readouterr().err

@@ -94,7 +94,7 @@ def _recording(request: TdIcpRequest, names: list[str]) -> Recording | None:
     try:
         return request.open()
     except RecordingError:
-        if all(name.startswith("/") or Path(name).is_file() for name in names):
+        if names and all(_is_topic(name) or Path(name).is_file() for name in names):
             return None
         raise
 
@@ -103,12 +103,18 @@ def _other_stream(
     request: TdIcpRequest, recording: Recording | None, name: str, base_ns: int | None
 ) -> tuple[OrientationStream, int]:
     """A sensor that is no camera: its orientations, and what was subtracted from its stamps."""
-    if name.startswith("/") and not Path(name).is_file():
+    if _is_topic(name):
         return pose_topic(request.path, name, base_ns)
     if Path(name).is_file():
         return trajectory_file(Path(name), base_ns, request.warn)
+    if Path(name).exists():
+        raise OptionError(f"{name}: one recording is taken, {request.path}; what follows it are its sensors")
     known = "" if recording is None else ", ".join([*recording.imus, *recording.cameras])
     raise OptionError(f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file")
+
+
+def _is_topic(name: str) -> bool:
+    return name.startswith("/") and not Path(name).exists()
 
 
 def _file(name: str) -> bool:
