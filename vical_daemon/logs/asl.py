@@ -38,6 +38,7 @@ from vical_daemon.logs.model import (
 )
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back_s
+from vical_daemon.logs.table_text import titles
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 from vical_daemon.logs.two_tables import one_table, read_sensor, two_tables
 from vical_daemon.logs.united_imu import forces_at
@@ -278,7 +279,8 @@ class AslRecording(Recording):
     def _load(self, path: Path, sensor: str, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
-        title = text[: text.find(b"\n")].decode("utf-8", "replace")
+        lines = titles(text)
+        title = next(filter(columns_by_title, lines), "".join(lines[:1]))
         if dtype == _IMU_ROW and degrees_named(title):
             raise RecordingError(f"{path}: {IN_DEGREES}")
         named = columns_by_title(title) if dtype == _IMU_ROW else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import io
 import os
@@ -18,11 +19,9 @@ from vical_drivers.user_files import open_file, read_file
 
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamps import date_ns
+from vical_daemon.logs.table_text import FIRST_ROW, first_row, with_commas
 
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
-_ROW = re.compile(rb"^[ \t]*[-+]?\.?\d[^\r\n]*", re.MULTILINE)
-SPACED_DATE = re.compile(rb"(\d{4}-\d\d-\d\d) +(?=\d\d:\d\d)")
-_SPACED_UNIT = re.compile(rb" *(\[[^\]]*\]|\([^)]*\))")
 _HEAD_BYTES = 4096  # title and first rows
 _MISSING = frozenset({b"", b"na", b"n/a", b"null", b"none", b"-"})
 _FIRST_NUMBERS = 20  # of these one stamp in seconds is not a whole one
@@ -49,7 +48,7 @@ def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> n
     Stamps keep all digits: integers, or text where the first is a fraction. Other integers may be written
     like 12.0.
     """
-    begin = _first_data_row(text)
+    begin = first_row(text)
     wanted = dtype
     dtype = np.dtype([(name, _type_read(dtype, name, text, begin)) for name in dtype.names or ()])
     if next(_data_lines(text, begin), None) is None:
@@ -104,7 +103,7 @@ def _type_read(dtype: np.dtype[Any], name: str, text: bytes, begin: int) -> np.d
 def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
     """Say which line of a table is not as many numbers as are needed, and what may be wrong with it."""
     if b"\0" in text:
-        return "this is not plain text (UTF-16 from a spreadsheet? save it as CSV UTF-8)"
+        return "this is not plain text (of a spreadsheet? save it as CSV)"
     count = columns_of(dtype)
     for number, line in _data_lines(text, begin):
         cells = [cell.strip() for cell in line.split(b",")]
@@ -182,38 +181,12 @@ def read_table(path: Path) -> bytes:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
     if not text or text.isspace():
         raise RecordingError(f"{path} is empty")
-    text = text.removeprefix(b"\xef\xbb\xbf")
+    text = text.removeprefix(codecs.BOM_UTF8)
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # "Unicode text" of spreadsheets
+        text = text.decode("utf-16", "replace").encode()
     if b"\n" not in text:
         text = text.replace(b"\r", b"\n")  # lines as old programs on a Macintosh end them
     return with_commas(text.replace(b'"', b""))  # some programs put every cell between quotes
-
-
-def with_commas(text: bytes) -> bytes:
-    """Return a table with commas between its cells, points in its numbers, and T in its dates.
-
-    Its first row tells how it was written: cells between semicolons or tabs may have decimal commas.
-    """
-    first = _ROW.search(text)
-    row = first[0].strip() if first else b""
-    if SPACED_DATE.search(row):
-        text, row = (SPACED_DATE.sub(rb"\1T", part) for part in (text, row))
-    for mark in (b";", b"\t"):
-        if mark in row.strip(b";") and b"," + mark not in row:
-            return text.translate(bytes.maketrans(b"," + mark, b".,"))
-    if b"," in row or not row.split()[1:]:
-        return text
-    begin = _ROW.search(text).start()  # type: ignore[union-attr]
-    title = _title_with_commas(text[:begin], len(row.split()))
-    return title + re.sub(rb"(?<=\S)[ \t]+(?=[^\s])", b",", text[begin:])
-
-
-def _title_with_commas(text: bytes, count: int) -> bytes:
-    """Return lines above rows of so many cells between spaces; without names where their number differs."""
-    lines = text.splitlines()
-    plain = _SPACED_UNIT.sub(lambda unit: unit[1].replace(b" ", b""), lines[-1] if lines else b"")
-    names = plain.strip(b"#% \t").split()
-    title = b"#" + b",".join(names if len(names) == count else [])
-    return b"\n".join([title, *[b"#"] * (len(lines) - 1), b""]) if lines else b""
 
 
 def _joined(folder: Path) -> bytes:
@@ -258,19 +231,6 @@ def _unpacked(path: Path) -> bytes:
     return text
 
 
-def _first_data_row(text: bytes) -> int:
-    """Return the offset behind a title line without ``#``, and behind units in the line below it."""
-    begin = 0
-    for _ in range(2):
-        end = text.find(b"\n", begin)
-        line = text[begin : end if end >= 0 else len(text)].strip()
-        numbers = begin and any(_NUMBER_BYTES.fullmatch(cell.strip()) for cell in line.split(b","))
-        if not line or line[:1].isdigit() or line[:1] in b"-+#" or numbers:
-            break
-        begin = end + 1 if end >= 0 else begin
-    return begin
-
-
 def imu_tables(root: Path) -> dict[str, Path]:
     """Return the tables of inertial readings of a folder by the names of the IMUs, in order of these.
 
@@ -290,15 +250,14 @@ def is_table(path: Path) -> bool:
     name = path.name.lower()
     if name.endswith((".csv", ".csv.gz")):
         return path.is_file()
-    return name.endswith((".txt", ".tsv")) and path.is_file() and title_of(path)[1].count(b",") > 2
+    row = FIRST_ROW.search(head_of(path)) if name.endswith((".txt", ".tsv")) and path.is_file() else None
+    return row is not None and row[0].count(b",") > 2
 
 
-def title_of(path: Path) -> tuple[bytes, bytes]:
-    """Return the first line of a table that is not packed, and its first row, both with commas."""
+def head_of(path: Path) -> bytes:
+    """Return titles and first rows of a table that is not packed, with commas."""
     try:
         with open_file(path) as file:
-            head = with_commas(file.read(_HEAD_BYTES).replace(b'"', b""))
+            return with_commas(file.read(_HEAD_BYTES).replace(b'"', b""))
     except OSError:
-        return b"", b""  # it is named when it is read
-    row = _ROW.search(head)
-    return head.split(b"\n", 1)[0], row[0] if row else b""
+        return b""  # it is named when it is read

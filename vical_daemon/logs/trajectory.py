@@ -14,7 +14,7 @@ import numpy as np
 from vical_drivers.user_files import read_file
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl_tables import SPACED_DATE, TABLE_LIMIT
+from vical_daemon.logs.asl_tables import TABLE_LIMIT
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamps import (
     UNIT_WORDS,
@@ -24,6 +24,7 @@ from vical_daemon.logs.stamps import (
     unit_by_spacing,
     unit_named,
 )
+from vical_daemon.logs.table_text import SPACED_DATE
 
 _SLOWEST_HZ, _USUAL_HZ, _FASTEST_HZ = 1.0, 50.0, 5000.0
 _LATEST_SECONDS = 1e12  # more than this are no seconds

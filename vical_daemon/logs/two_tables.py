@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl_tables import is_table, load_table, read_table, title_of
+from vical_daemon.logs.asl_tables import head_of, is_table, load_table, read_table
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers
+from vical_daemon.logs.table_text import titles
 from vical_daemon.logs.titled_columns import (
     IN_DEGREES,
     axes_by_title,
@@ -63,7 +64,7 @@ def two_tables(root: Path) -> tuple[Path, Path] | None:
 def one_table(root: Path) -> Path | None:
     """Return the one table of a folder whose title names all six axes; None: there is none, or several."""
     tables = sorted(p for p in root.iterdir() if is_table(p) and p.suffix != ".gz")
-    found = [p for p in tables if columns_by_title(title_of(p)[0].decode("utf-8", "replace")) is not None]
+    found = [p for p in tables if any(map(columns_by_title, titles(head_of(p))))]
     return found[0] if len(found) == 1 else None
 
 
@@ -81,7 +82,8 @@ def read_sensor(path: Path) -> SensorTable:
         RecordingError: It is none, or its title says that rates are in degrees.
     """
     text = read_table(path)
-    title = text[: text.find(b"\n")].decode("utf-8", "replace")
+    lines = titles(text)
+    title = next(filter(axes_by_title, lines), "".join(lines[:1]))
     if names_degrees(title):
         raise RecordingError(f"{path}: {IN_DEGREES}")
     columns = axes_by_title(title)

@@ -75,6 +75,39 @@ def test_a_title_between_spaces_names_the_columns(asl_folder, tmp_path):
     assert list(open_recording(folder).messages()) == expected
 
 
+@pytest.mark.parametrize(
+    "above",
+    ["sep=,\n", "# recorded by hand\n# 2026-01-31 12:00, 200 Hz\n", "Recorder;Version 3\n\nby: hand, me\n"],
+    ids=["Excel", "comments", "text"],
+)
+def test_lines_above_the_title_do_not_hide_the_order_of_the_columns(asl_folder, tmp_path, above):
+    expected = list(open_recording(asl_folder).messages())
+    folder = shutil.copytree(asl_folder, tmp_path / "asl")
+    path = folder / "mav0/imu0/data.csv"
+    rows = path.read_text().splitlines()[1:]
+    rows = [",".join([c[0], *c[4:], *c[1:4]]) for c in (row.split(",") for row in rows)]
+    path.write_text(above + "time,ax,ay,az,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    assert list(open_recording(folder).messages()) == expected
+
+
+def test_a_table_of_both_sensors_in_turns_is_named(asl_folder, tmp_path):
+    folder = shutil.copytree(asl_folder, tmp_path / "asl")
+    path = folder / "mav0/imu0/data.csv"
+    path.write_text("sensor,time,x,y,z\n" + "gyroscope,1,2,3,4\naccelerometer,1,2,3,4\n" * 20)
+    with pytest.raises(
+        RecordingError, match=r"line 2 is not 7 numbers \(gyro and accelerometer in two tables"
+    ):
+        open_recording(folder)
+
+
+def test_unicode_text_of_a_spreadsheet_is_read(asl_folder, tmp_path):
+    expected = list(open_recording(asl_folder).messages())
+    folder = shutil.copytree(asl_folder, tmp_path / "asl")
+    path = folder / "mav0/imu0/data.csv"
+    path.write_text(path.read_text().replace(",", "\t"), encoding="utf-16")
+    assert list(open_recording(folder).messages()) == expected
+
+
 def test_an_imu_may_be_a_text_file(asl_folder, tmp_path):
     expected = list(open_recording(asl_folder).messages())
     folder = shutil.copytree(asl_folder, tmp_path / "asl")

@@ -304,7 +304,7 @@ def test_the_line_that_is_wrong_is_named(tmp_path, write_asl, change, message, r
 def test_a_table_that_is_no_plain_text_is_named_as_that(tmp_path, write_asl):
     folder = write_asl(tmp_path / "a")
     path = folder / "mav0/imu0/data.csv"
-    path.write_text(path.read_text(), encoding="utf-16")
+    path.write_text(path.read_text(), encoding="utf-16-be")  # without the mark that says so
     with pytest.raises(RecordingError, match="not plain text"):
         open_recording(folder)
 
