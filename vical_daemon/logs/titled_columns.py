@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 IN_DEGREES = "its title gives the gyro in degrees; rad/s are expected: multiply by pi/180, correct the title"
 _IN_ORDER = tuple(range(7))
-_IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|ang\w*acc")
+_IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|ang\w*acc|accura")
 _GYRO = re.compile(r"gyr|omega|ang\w*\W?(vel|rate|speed)|rot\w*\W?(vel|rate|speed)|^[wg]_?(rs_s)?_?[xyz]$")
 _ACCEL = re.compile(r"acc|specific|force|^a_?(rs_s)?_?[xyz]$|^f_?[xyz]$")
 _DEGREES = re.compile(r"deg|dps|°")

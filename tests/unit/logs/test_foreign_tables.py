@@ -194,20 +194,12 @@ def kitti(tmp_path, a_motion):
         for name in ("image_00", "oxts"):
             (folder / name / "data").mkdir(parents=True)
         t_ns, gyro, force = a_motion()
-        names = [
-            "lat",
-            "lon",
-            *("ax", "ay", "az"),
-            *("af", "al", "au"),
-            *("wx", "wy", "wz"),
-            "wf",
-            "wl",
-            "wu",
-        ]
+        names = "lat lon alt roll pitch yaw vn ve vf vl vu ax ay az af al au wx wy wz wf wl wu pos_accuracy"
+        names = [*names.split(), "vel_accuracy", "navstat", "numsats", "posmode", "velmode", "orimode"]
         (folder / "oxts/dataformat.txt").write_text("".join(f"{n}:   what {n} is (unit)\n" for n in names))
         stamps = []
         for i, k in enumerate(range(0, len(t_ns), every)):
-            row = [49.0, 8.4, *force[k], 7, 7, 7, *gyro[k], 8, 8, 8]
+            row = [*[7.0] * 11, *force[k], 7, 7, 7, *gyro[k], *[8.0] * 10]
             (folder / f"oxts/data/{i:010d}.txt").write_text(" ".join(map(repr, map(float, row))) + " \n")
             stamps.append(date(int(t_ns[k]), " "))
         (folder / "oxts/timestamps.txt").write_text("\n".join(stamps[: len(stamps) - cut]) + "\n")
