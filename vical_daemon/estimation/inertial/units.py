@@ -14,10 +14,9 @@ from vical_daemon.estimation.measurements import STANDARD_GRAVITY_MPS2, FloatArr
 
 _SMOOTHING_S = 0.5  # of forces and rates: what is left of hand-held forces is mostly gravity
 _LIKE_GRAVITY = (6.0, 16.0)  # m/s^2: where the median of a moving accelerometer may be
-_GRAVITY_REMOVED, _MOVES = 0.4, 0.8
-"""Of the median, which 5 % of the readings are below where gravity is removed: motion passes through zero.
-Hand-held motion of 2 m/s^2 on top of gravity leaves 0.8 of it. In between it shows in whether what is
-measured turns with the gyro."""
+_MOVES = 0.8
+"""Of the median, which 5 % of the readings are below where gravity is removed, because motion passes through
+zero, or where it is violent. Hand-held motion of 2 m/s^2 on top of gravity leaves 0.8 of it."""
 _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
@@ -25,8 +24,10 @@ _SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
 _LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
 _STANDS = 0.05  # of the change that the gyro's rates mean
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
+_NO_FORCE_MPS2 = 500.0  # 50 g, the widest range of accelerometers
 _UNIT = 1e-2  # quaternions written with three digits
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
+_Turns = tuple[FloatArray, FloatArray]
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
 
 
@@ -48,12 +49,9 @@ def unit_mistake(samples: ImuArrays) -> str:
     rate_hz = usual_rate_hz(samples.t_ns)
     if not rate_hz:
         return ""
-    ratio, correlation = gyro_scale(samples, rate_hz)
-    return (
-        _accelerometer_mistake(samples, correlation)
-        or _gyro_mistake(ratio, correlation)
-        or _turns_at_rest(samples, rate_hz)
-    )
+    turns = _turns(samples, rate_hz)
+    _, correlation = _scale(turns)
+    return _accelerometer_mistake(samples, correlation) or _gyro_mistake(turns) or _turns_at_rest(turns)
 
 
 def usual_rate_hz(t_ns: IntArray) -> float:
@@ -77,17 +75,17 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
     first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
     if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
         text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
-    elif (
-        _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro and slow > _GRAVITY_REMOVED * gyro
-    ) or _swapped(samples, correlation):
+    elif _swapped(samples, correlation) or (
+        median < gyro
+        and _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1]
+        and (correlation < _SURELY_TURNS or slow > _MOVES * gyro)
+    ):
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
+    elif _LIKE_GRAVITY[1] < median < _NO_FORCE_MPS2 and low < _MOVES * median:
+        return ""  # violent motion
     elif constant := constant_channels(samples):
         text = constant
-    elif (
-        low < _GRAVITY_REMOVED * median
-        or median < 0.6
-        or (low < _MOVES * median and correlation < _TURNS_WITH_GYRO)
-    ):
+    elif median < 0.6 or (low < _MOVES * median and correlation < _TURNS_WITH_GYRO):
         text = "gravity seems to be removed: record the accelerometer as it is"
     elif 0.6 < median < 1.6:
         text = f"it looks like g: multiply by {STANDARD_GRAVITY_MPS2}"
@@ -132,14 +130,15 @@ def gyro_mistake(samples: ImuArrays) -> str:
         samples: In order of their stamps.
     """
     rate_hz = usual_rate_hz(samples.t_ns)
-    return _gyro_mistake(*gyro_scale(samples, rate_hz)) if rate_hz else ""
+    return _gyro_mistake(_turns(samples, rate_hz)) if rate_hz else ""
 
 
-def _gyro_mistake(ratio: float, correlation: float) -> str:
+def _gyro_mistake(turns: _Turns | None) -> str:
+    ratio, correlation = _scale(turns)
     shows = "what the turning of gravity in the accelerometer shows; rad/s are expected"
-    if correlation > _TURNS_WITH_GYRO and 0.004 < ratio < 0.07:
+    if correlation > _TURNS_WITH_GYRO and 0.004 < ratio < 0.07 and _beyond_bias(turns):
         return f"the gyro reads {1 / ratio:.0f} times {shows}, it looks like deg/s: multiply by pi/180"
-    if correlation > _TURNS_WITH_GYRO and ratio > 15:
+    if correlation > _SURELY_TURNS and ratio > 15:
         return f"the gyro reads only 1/{ratio:.0f} of {shows}, check its unit"
     return ""
 
@@ -151,7 +150,10 @@ def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
     0.5 s the specific force is mostly gravity, so scale = <df, -w x f dt> / |w x f dt|^2 is near 1 for
     rad/s (0.5 to 1 on hand-held recordings) and near pi/180 for deg/s.
     """
-    turns = _turns(samples, rate_hz)
+    return _scale(_turns(samples, rate_hz))
+
+
+def _scale(turns: _Turns | None) -> tuple[float, float]:
     if turns is None:
         return 1.0, 0.0
     seen, expected = turns
@@ -162,7 +164,15 @@ def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
     return product / power, product / float(np.sqrt(power * (seen**2).sum()) + 1e-300)
 
 
-def _turns(samples: ImuArrays, rate_hz: float) -> tuple[FloatArray, FloatArray] | None:
+def _beyond_bias(turns: _Turns | None) -> bool:
+    """Whether gravity should turn faster, by the gyro, than because of any bias."""
+    if turns is None:
+        return False
+    expected = float(np.median(np.linalg.norm(turns[1], axis=1)))
+    return expected > _LARGEST_BIAS_RPS * STANDARD_GRAVITY_MPS2
+
+
+def _turns(samples: ImuArrays, rate_hz: float) -> _Turns | None:
     """Return how the specific force changes within 1 s, and how it should by the gyro; None: too short."""
     width = max(1, round(_SMOOTHING_S * rate_hz))
     if len(samples.t_ns) < 6 * width:
@@ -173,13 +183,12 @@ def _turns(samples: ImuArrays, rate_hz: float) -> tuple[FloatArray, FloatArray] 
     return force[2 * width :] - force[: -2 * width], turned[2 * width :] - turned[: -2 * width]
 
 
-def _turns_at_rest(samples: ImuArrays, rate_hz: float) -> str:
+def _turns_at_rest(turns: _Turns | None) -> str:
     """Say that the gyro reads a lasting rate that gravity in the accelerometer does not show at all."""
-    turns = _turns(samples, rate_hz)
-    if turns is None:
+    if turns is None or not _beyond_bias(turns):
         return ""
     seen, expected = (float(np.median(np.linalg.norm(x, axis=1))) for x in turns)
-    if expected < _LARGEST_BIAS_RPS * STANDARD_GRAVITY_MPS2 or seen > _STANDS * expected:
+    if seen > _STANDS * expected:
         return ""
     return (
         f"the gyro reads about {expected / STANDARD_GRAVITY_MPS2:.2g} although gravity in the accelerometer "

@@ -76,7 +76,7 @@ def test_two_windows_that_agree_are_believed_again():
 
 def test_an_accelerometer_in_g_is_named_before_the_start():
     status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
-    noise = 1e-3 * np.random.default_rng(0).standard_normal((1200, 6))
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((2200, 6))
     for k, (w, f) in enumerate(zip(noise[:, :3], noise[:, 3:], strict=True)):
         status.saw_reading(5_000_000 * k, w, f + np.array([0.0, 0.0, 1.0]))
     estimate = status.estimate(None, 0.0, running=False, gravity=[])
