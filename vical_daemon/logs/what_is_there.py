@@ -14,6 +14,8 @@ _TABLES = frozenset({".csv", ".txt", ".tsv", ".json"})
 _OF_RECORDINGS = frozenset({"mav0", "oxts"})  # folders: ASL, KITTI
 _LOGS = frozenset({".mcap", ".bag", ".db3"})
 _LOOKED_AT = 200  # entries of a folder; what is in it shows in the first ones
+_PARTS = ("mav0", "imu", "cam", "oxts", "image_")
+_UP = 3  # folders up from mav0/imu0/data.csv
 _NAMED = 4  # in a message of one line
 
 
@@ -23,6 +25,8 @@ def what_is_there(folder: Path) -> str:
     Args:
         folder: That was given.
     """
+    if whole := whole_recording(folder):
+        return f"; it is part of a recording: give {whole}"
     entries = _entries(folder)
     recordings = [
         e.name for e in entries if any(x.name in _OF_RECORDINGS or x.suffix in _LOGS for x in _entries(e))
@@ -37,6 +41,16 @@ def what_is_there(folder: Path) -> str:
         f"{_listed(videos)} ({FROM_VIDEO})" if videos else "",
     ]
     return f"; found {', '.join(filter(None, found))}" if any(found) else ""
+
+
+def whole_recording(part: Path) -> str:
+    """Return the recording above a folder or table that is its imu or one of its cameras; empty: none."""
+    for place in list(part.parents)[:_UP]:
+        inside = {p.name for p in _entries(place)}
+        whole = "mav0" in inside or {"imu0", "cam0"} <= inside or {"oxts", "image_00"} <= inside
+        if whole and part.relative_to(place).parts[0].startswith(_PARTS):
+            return str(place)
+    return ""
 
 
 def images_in(folder: Path) -> str:

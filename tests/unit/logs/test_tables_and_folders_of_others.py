@@ -102,6 +102,14 @@ def test_what_may_have_been_meant_is_named(tmp_path, asl_folder, files, says):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("part", ["mav0/cam0", "mav0/imu0", "mav0/imu0/data.csv"])
+def test_a_part_in_place_of_the_recording_is_named(folder, part):
+    says = f"it is part of a recording: give {folder}/mav0"
+    with pytest.raises((RecordingError, InputError), match=says) as refused:
+        make_job(open_recording(folder / part), Initial(), target=None)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_video_is_no_recording(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"x")
     with pytest.raises(
