@@ -147,6 +147,7 @@ _ACTIONABLE = {
     EventKind.TIMESHIFT_VARIES,
     EventKind.IMU_NOISE,
     EventKind.IMU_CLIPPED,
+    EventKind.IMU_UNITS,
     EventKind.ACCEL_LAG,
     EventKind.TARGET_SIZE,
     EventKind.TARGET_RATIO,
