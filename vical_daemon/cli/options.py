@@ -58,11 +58,11 @@ def fit(text: str, width: int) -> str:
 
 
 class _Once(argparse.Action):
-    """Stores a value; a second, other one is refused: argparse would silently take the last."""
+    """Stores a value; of several the last, as argparse does, but not silently."""
 
     def __call__(
         self,
-        parser: argparse.ArgumentParser,
+        _parser: argparse.ArgumentParser,
         namespace: argparse.Namespace,
         values: Any,
         option_string: str | None = None,
@@ -70,7 +70,8 @@ class _Once(argparse.Action):
         """Take one value."""
         before = getattr(namespace, self.dest, self.default)
         if option_string and before is not self.default and before != values:
-            parser.error(f"{option_string} is given twice, with {before} and {values}; give it once")
+            text = f"{option_string} is given twice: {values} is used, {before} is not"
+            print(f"vical: warning: {text}", file=sys.stderr)
         setattr(namespace, self.dest, values)
 
 

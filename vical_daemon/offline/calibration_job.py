@@ -13,7 +13,7 @@ from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream, meant
 from vical_daemon.logs.channel import force_of, negative, stamp_of, with_force
-from vical_daemon.logs.what_is_there import what_is_there, whole_recording
+from vical_daemon.logs.what_is_there import whole_recording
 from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.camera_names import priors_meant
 from vical_daemon.offline.errors import InputError, OptionError, size_unknown
@@ -127,8 +127,9 @@ def make_job(
     if not chosen:
         reasons = ("unreadable", "no stamps", "no cameras")
         unread = "; ".join(w for w in recording.warnings if any(reason in w for reason in reasons))
-        there = what_is_there(recording.path) if whole_recording(recording.path) else ""
-        why = f" ({unread})" if unread else there or "; `vical info` shows what is in it"
+        whole = whole_recording(recording.path)
+        hint = f"it is part of a recording: give {whole}" if whole else "`vical info` shows what is in it"
+        why = f" ({unread})" if unread else f"; {hint}"
         raise InputError(f"{recording.path} holds no camera, neither images nor points{why}")
     cameras = priors_meant(initial, chosen)
     priors = {name: _prior(name, stream, cameras.get(name), fix) for name, stream in chosen.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -109,7 +110,7 @@ def test_several_imus_are_named_with_their_topics():
         name: SimpleNamespace(name=name, source=topic, kind="imu")
         for name, topic in (("zed", "/zed/imu/data"), ("zed_2", "/zed/imu/data_raw"))
     }
-    recording = SimpleNamespace(duration_s=10.0, imus=streams, cameras={}, path="a.bag", warnings=[])
+    recording = SimpleNamespace(duration_s=10.0, imus=streams, cameras={}, path=Path("a.bag"), warnings=[])
     says = r"2 imus \(zed: /zed/imu/data, zed_2: /zed/imu/data_raw\); say which with --imu"
     with pytest.raises(OptionError, match=says):
         make_job(recording, read_initial_empty(), target=None)
