@@ -105,7 +105,10 @@ def images_by_name(folder: Path) -> Images:
 
 
 def _times_of(folder: Path, images: list[Path]) -> list[str]:
-    """Return the stamps of a file with a line for each image, `[name] stamp ...`; [] if there is none."""
+    """Return the stamps of a file with a line for each image, `[name] stamp ...`; [] if there is none.
+
+    A title above them may name the column of the stamps.
+    """
     places = (folder, folder / "data", folder.parent)
     path = next((p for place in places for name in _TIMES for p in sorted(place.glob(name))), None)
     if path is None:
@@ -113,12 +116,17 @@ def _times_of(folder: Path, images: list[Path]) -> list[str]:
     rows = [
         line.replace(",", " ").split() for line in read_table(path).decode("utf-8", "replace").splitlines()
     ]
-    rows = [row for row in rows if row and not row[0].startswith("#")]
-    if len(rows) != len(images):
+    rows = [row for row in rows if row]
+    above = [row for row in rows if row[0].startswith("#") or not any(map(_is_stamp, row))]
+    rows = [row for row in rows if row not in above]
+    if len(rows) != len(images) or not rows:
         return []
     named = all(len(row) > 1 and Path(row[0]).stem == p.stem for row, p in zip(rows, images, strict=True))
-    stamps = [row[1 if named else 0] for row in rows]
-    return stamps if all(map(_is_stamp, stamps)) else []
+    titles = [[name for name in row if name[:1] != "[" and name != "#"] for row in above]
+    titles = [title for title in titles if len(title) == len(rows[0])]
+    column = next((i for title in titles for i, name in enumerate(title) if "stamp" in name), int(named))
+    stamps = [row[column] for row in rows if column < len(row)]
+    return stamps if len(stamps) == len(rows) and all(map(_is_stamp, stamps)) else []
 
 
 def _in_order(folder: Path, suffixes: set[str]) -> list[Path]:

@@ -49,6 +49,14 @@ def levels(recording):
         (lambda i, t: f"frame{i}", ("mav0/timestamps.txt", lambda i, t: f"{t}")),
         (lambda i, t: f"{i}", ("mav0/VID_20260101_timestamps.csv", lambda i, t: f"{t}")),
         (lambda i, t: f"{i}", ("mav0/cam0/frame_timestamps.txt", lambda i, t: f"{t}")),
+        (
+            lambda i, t: f"{i}",
+            (
+                "mav0/cam0/times.txt",
+                lambda i, t: "# id timestamp name\n" * (not i) + f"{i} {t * 1e-9:.9f} {i}.png",
+            ),
+        ),
+        (lambda i, t: f"{i}", ("mav0/cam0/timestamps.csv", lambda i, t: "time\n" * (not i) + f"{t}")),
         (lambda i, t: f"{t}", ("mav0/cam0/data.csv", lambda i, t: f"{t},{t}")),
         (lambda i, t: f"{t}", ("mav0/cam0/data.csv", lambda i, t: f"{t},cam0/data/{t}.png")),
     ],
@@ -58,6 +66,8 @@ def levels(recording):
         "ns",
         "OpenCamera",
         "MARS",
+        "a title that names the stamps",
+        "a title",
         "no ending",
         "folders in the table",
     ],
