@@ -332,7 +332,7 @@ def about_a_point(
     """
     rng = np.random.default_rng([seed, 16])
     turn = _three_waves(rng, np.zeros(3), np.deg2rad([6.0, 6.0, 8.0]), (0.4, 1.3))
-    R, p = _imu_in_camera(T_imu_cam)
+    R, p = _imu_in_camera(T_imu_cam) or (np.eye(3), np.zeros(3))
     place = Sinusoids(_viewpoint(board_size_m, distance_m, side))
     return Trajectory(turn, place, _viewing_base(side), (R, p - np.asarray(point_m)))
 

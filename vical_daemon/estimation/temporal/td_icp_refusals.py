@@ -81,8 +81,8 @@ def explain(
             "the rotations are mirrored: one gyro axis has the wrong sign, or two axes are swapped; the IMU "
             "frame must be right-handed"
         )
-    for factor, unit in _UNITS.items():
-        scaled = reference.scaled(factor)
+    for scale, unit in _UNITS.items():
+        scaled = reference.scaled(scale)
         if scaled and _score(scaled.start(t_s, q_world_sensor, shifts_s)[0]) < limit:
             return f"the gyro's rates {unit} (then the rotations fit)"
     factor = estimate_clock_rate(reference.curve(np.zeros(3)), t_s, q_world_sensor, shifts_s)
