@@ -102,7 +102,6 @@ class LinearStart:
         gravity: Acceleration of free fall, m/s^2; as found, it does not have the right length yet.
         p_imu_cam: Lever arm, m, shape (3,).
         accel_bias: m/s^2.
-        sigma_p_imu_cam: Standard deviations, m, shape (3,); 0 where it was known.
         size: True size of the target over the stated one; 1 where that was not asked for.
         sigma_size: Its standard deviation; 0 likewise.
     """
@@ -112,7 +111,6 @@ class LinearStart:
     gravity: FloatArray
     p_imu_cam: FloatArray
     accel_bias: FloatArray
-    sigma_p_imu_cam: FloatArray
     size: float = 1.0
     sigma_size: float = 0.0
 
@@ -160,17 +158,14 @@ def linear_start(
     A_all = np.vstack([rows, np.zeros((6, A.shape[2]))])
     A_all[-6:, : len(free)] = prior[:, free]
     x, *_ = np.linalg.lstsq(A_all, np.concatenate([y, prior[:, free] @ z[free]]), rcond=None)
-    variance = float(np.mean((y - rows @ x) ** 2))
-    sigma = np.sqrt(np.diag(np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)))
     k, size = len(free), (1.0, 0.0)
     if free_size:  # all of x is in stated sizes: the integrals times 1/s
+        variance = max(float(np.mean((y - rows @ x) ** 2)), 1.0)
+        sigma = float(np.sqrt(variance * np.linalg.pinv(A_all.T @ A_all)[-1, -1]))
         s = 1.0 / float(x[-1])
-        size = (s, float(sigma[-1]) * s * s)
-        x, sigma = x * s, sigma * abs(s)
+        x, size = x * s, (s, sigma * s * s)
     z[free] = x[:k]
-    sigmas = np.zeros(12)
-    sigmas[free] = sigma[:k]
-    return LinearStart(x[k : k + 3], z[SPEED], z[GRAVITY], z[ARM], z[BIAS], sigmas[ARM], *size)
+    return LinearStart(x[k : k + 3], z[SPEED], z[GRAVITY], z[ARM], z[BIAS], *size)
 
 
 def drift_covariance(T: FloatArray, force_sigma: float) -> FloatArray:

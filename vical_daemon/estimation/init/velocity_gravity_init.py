@@ -23,7 +23,6 @@ _GRAVITY = (
 )
 _STRETCH_S = 10.0  # of the latest poses: biases are constant over it
 _LEAST_POSES = 15  # in it
-_MOST_ARM_M = 0.1  # sigma of a lever arm from which a window still finds its way
 _NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
 
 
@@ -125,9 +124,6 @@ def motion_start(
         if may_resize and not partial:
             other = other or _other_size(solve(free_size=True), options.gravity_mps2)
         linear = solve(held_axes=axes)
-        if float(np.max(linear.sigma_p_imu_cam)) > _MOST_ARM_M and not partial:
-            why = f"{name}: lever arm not yet visible: turn the rig about two axes"
-            return StartResult(None, why, motion_missing=True, size=other)
         if "extrinsics" not in options.fix:
             camera.p_imu_cam = linear.p_imu_cam
         if state is None:
