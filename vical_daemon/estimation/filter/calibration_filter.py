@@ -39,6 +39,7 @@ from vical_daemon.estimation.filter.linearise import (
     view_derivatives,
 )
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.filter.reset import move
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
@@ -48,10 +49,8 @@ from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import ROUNDING
 from vical_daemon.estimation.model.rates import Rates, rates_after
-from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
-    ATTITUDE,
     GRAVITY,
     GYRO_BIAS,
     MOTION,
@@ -65,8 +64,6 @@ from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
 from vical_daemon.estimation.robust import median
-
-_TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 
 
 @dataclass(slots=True)
@@ -218,7 +215,7 @@ class CalibrationFilter:
         score = self._arm_score(image, lin, fit)
         self.arm_scores = self.arm_scores + score
         before = self.S
-        self._accept(fit.S, fit.dx + self._step_by(score, fit.S))
+        self._accept(fit.S, fit.dx + self._step_by(score, fit.S), image.camera)
         rows = whitened(image, lin, fit) if lin.curved.size else (fit.ways, fit.r)
         self.passed.append(Corrected(before, self.S, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
@@ -322,24 +319,15 @@ class CalibrationFilter:
     def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
         return self._with_shared(image, by_sigma_points(self.state, self.layout, self.rates, image, dx, S))
 
-    def _accept(self, S: FloatArray, dx: FloatArray) -> None:
-        """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
-        turned = [ATTITUDE] + [c.rotation for c in self.layout.cameras.values() if c.rotation is not None]
-        for s in turned:
-            x, y, z = (0.5 * dx[s]).tolist()
-            if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
-                self._turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
-        g = self.state.gravity
-        turn = so3.hat(g) @ dx[GRAVITY] / (g @ g)
-        if max(abs(turn)) > 2.0 * _TURNED_RAD:
-            self._turn_rows(S, GRAVITY, so3.exp_one(turn))
-        self.S = S
-        self.state = retract(self.state, self.layout, dx)
+    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> None:
+        """Take a correction by an image of a camera: square root of the covariance, and step of the state."""
+        jumps = None if self.jumped is None else self.jumped.D
+        self.state, self.S = move(self.state, self.layout, S, dx, camera, jumps)
 
-    def _turn_rows(self, S: FloatArray, rows: slice, T: FloatArray) -> None:
-        unscented.turn_rows(S, rows, T)
-        if self.jumped is not None:
-            self.jumped.D[rows] = T @ self.jumped.D[rows]
+    def step(self, dx: FloatArray) -> None:
+        """Move the nominal state by errors, shape (n,); what is known of them stays."""
+        seen = next(name for name in self.layout.cameras if name not in self.absent)
+        self._accept(self.S.copy(), dx, seen)
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
         """Bias that this image adds to the information vector, see `LeverArmScore.update`."""

@@ -25,7 +25,7 @@ from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import camera_points, pose_points
-from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, Layout, State
+from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, CameraState, Layout, State
 from vical_daemon.estimation.model.target_modes import MODES
 from vical_daemon.estimation.model.target_view import view
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
@@ -123,6 +123,7 @@ def project_errors(
     known = state.cameras[camera]
     motion = pose_points(state, errors)
     cam = camera_points(known, layout, camera, errors)
+    motion = motion._replace(p=motion.p + _kept_straight(state, known, motion.R, cam.p_imu_cam, errors))
     world: FloatArray = points * state.target_scale
     if layout.target_scale is not None:
         world = points * (state.target_scale + errors[:, layout.target_scale])[:, None, None]
@@ -137,6 +138,15 @@ def project_errors(
     for _ in range(_ROW_STEPS if uv is None else 0):
         rows = read_share(project(rows), known.resolution, known.readout_axis)
     return project(rows)
+
+
+def _kept_straight(
+    state: State, known: CameraState, R: FloatArray, p_imu_cam: FloatArray, errors: FloatArray
+) -> FloatArray:
+    """Added to the positions of sigma points: those of the camera are linear in the errors, see `reset`."""
+    arm = known.p_imu_cam
+    straight = p_imu_cam - np.cross(arm, errors[:, ATTITUDE])
+    return straight @ state.R_world_imu.T - np.matvec(R, p_imu_cam)
 
 
 def bend_by_jitter(

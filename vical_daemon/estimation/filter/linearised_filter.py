@@ -101,7 +101,9 @@ class LinearisedFilter(CalibrationFilter):
     def plain(self) -> CalibrationFilter:
         """The filter that goes on from the mean."""
         known = {x.name: getattr(self, x.name) for x in fields(CalibrationFilter)}
-        return CalibrationFilter(**known | {"state": self.mean})
+        out = CalibrationFilter(**known)
+        out.step(self.offset)
+        return out
 
     def predict(self, segment: ImuSegment) -> None:
         """Propagate to the end of a segment; the reference goes on from its own instant where it has one."""
@@ -164,6 +166,6 @@ class LinearisedFilter(CalibrationFilter):
         score[-1] = 0.0
         return score
 
-    def _accept(self, S: FloatArray, dx: FloatArray) -> None:
+    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> None:  # noqa: ARG002
         """Move the mean; the reference stays."""
         self.S, self.offset = S, self.offset + dx

@@ -11,7 +11,6 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA, OFF, SURE
-from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.shared_errors import MEMORY
@@ -80,7 +79,7 @@ def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
     W = solve_lower(L, entries @ f.S.T).T
     dx = W @ solve_lower(L, block.values)
     f.inflate_covariance(W)
-    f.state = retract(f.state, f.layout, dx)
+    f.step(dx)
 
 
 _KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}

@@ -1,0 +1,78 @@
+"""Moving the nominal state by a correction, and the covariance with it (reset of an error-state filter).
+
+Errors are small turns and steps about the nominal state. A correction changes what they mean. Two changes
+matter here: rotations do not add, and a camera's position depends on the product of a turn and a lever arm.
+
+Images show where a camera is to a few hundredths of a millimetre, while in slow motion lever arm and attitude
+may be uncertain by centimetres and milliradians. Attitude, position and lever arm are then strongly
+correlated. Had a correction of the attitude not changed their covariance, the next image would contradict it
+by the product of both uncertainties, and the filter would take that for information on the lever arm. So
+errors are defined such that the position of the camera is linear in them. [docs/math/filter.md, eq. (22)]
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.state import ATTITUDE, GRAVITY, POSITION, Layout, State
+
+_TURNED_RAD = 5e-5  # half a turn below which the covariance of a rotation stays
+_MOVED = 1e-3  # change of how errors move a camera, over how far they move it, below which it stays
+
+
+def move(
+    state: State, layout: Layout, S: FloatArray, dx: FloatArray, camera: str, jumps: FloatArray | None = None
+) -> tuple[State, FloatArray]:
+    """Return the state moved by a correction, and the square root of its covariance.
+
+    Args:
+        state: Nominal state; not changed.
+        layout: Where the errors live.
+        S: Square root of the covariance after the correction, by errors of `state`, shape (n, n); used up.
+        dx: The correction, shape (n,).
+        camera: Whose position is linear in the errors: the one whose image it was.
+        jumps: Other columns of errors, changed likewise in place, shape (n, k).
+    """
+    columns = [S] if jumps is None else [S, jumps]
+    seen = [camera_moves(state, layout, camera, X) for X in columns]
+    for where, T in _turns(state, layout, dx):
+        unscented.turn_rows(S, where, T)
+        if jumps is not None:
+            jumps[where] = T @ jumps[where]
+    moved = retract(state, layout, dx)
+    before, after = state.cameras[camera].p_imu_cam, moved.cameras[camera].p_imu_cam
+    goes = camera_moves(state, layout, camera, dx)
+    p_cam = state.p_world_imu + state.R_world_imu @ before + goes
+    moved.p_world_imu = p_cam - moved.R_world_imu @ after
+    more = [was - camera_moves(moved, layout, camera, X) for was, X in zip(seen, columns, strict=True)]
+    if (np.vecdot(more[0], more[0]) > _MOVED**2 * np.vecdot(seen[0], seen[0])).any():
+        for X, m in zip(columns, more, strict=True):
+            X[POSITION] += m
+        S = unscented.lower_root(S)
+    return moved, S
+
+
+def camera_moves(state: State, layout: Layout, camera: str, errors: FloatArray) -> FloatArray:
+    """How errors, shape (n,) or (n, k), move a camera in the world, m, shape (3,) or (3, k)."""
+    where, R = layout.cameras[camera].position, state.R_world_imu
+    out: FloatArray = errors[POSITION] - R @ (so3.hat(state.cameras[camera].p_imu_cam) @ errors[ATTITUDE])
+    return out if where is None else out + R @ errors[where]
+
+
+def _turns(state: State, layout: Layout, dx: FloatArray) -> list[tuple[slice, FloatArray]]:
+    """Reset Jacobians of the rotations and of gravity that turn noticeably."""
+    turned = [ATTITUDE] + [c.rotation for c in layout.cameras.values() if c.rotation is not None]
+    out = []
+    for where in turned:
+        x, y, z = (0.5 * dx[where]).tolist()
+        if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
+            out.append((where, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]])))
+    g = state.gravity
+    turn = so3.hat(g) @ dx[GRAVITY] / (g @ g)
+    if max(abs(turn)) > 2.0 * _TURNED_RAD:
+        out.append((GRAVITY, so3.exp_one(turn)))
+    return out
