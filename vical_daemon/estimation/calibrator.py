@@ -110,9 +110,7 @@ class Calibrator:
         if frame.camera not in self.rig.priors or not self._intake.takes_images or nonsense:
             self._intake.images_ignored += 1
             return
-        if not ok.all():
-            sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
-            frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
+        frame = frame if ok.all() else frame.only(ok)
         t_cam_s = self._intake.take_image(frame)
         self.evaluator.announce_all(self._intake.image_news())
         if t_cam_s is None:

@@ -138,6 +138,11 @@ class PointsFrame:
     uv_px: FloatArray
     sigma_px: FloatArray | None = None
 
+    def only(self, chosen: BoolArray) -> PointsFrame:
+        """The same image with some of its points: a mask of shape (n,)."""
+        sigma_px = None if self.sigma_px is None else self.sigma_px[chosen]
+        return PointsFrame(self.camera, self.t_cam_ns, self.ids[chosen], self.uv_px[chosen], sigma_px)
+
 
 Frames = list[tuple[float, PointsFrame]]
 """Stamps in the camera's clock, s, and points; in order of time."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import LEAST_POINTS, PointsFrame
+from vical_daemon.estimation.temporal.td_icp_refusals import ONLY_IMU_TURNS, turns_clearly
 
 LONG_S = 8.0  # of data: much for a start; more of them would not make it better
 _GROWTH, _MOST_S = 1.25, 4.0  # each pause over the one before; the longest
@@ -64,6 +66,14 @@ class RestDetector:
     def rests_since(self, t_cam_s: float) -> bool:
         """Whether the images show no motion since a stamp, s."""
         return self.rests and self._since is not None and self._since[0] <= t_cam_s
+
+
+def rest_in_words(buffer: ImuBuffer, advice: str) -> str:
+    """What images without motion mean, with the readings meanwhile; `advice`: how to move."""
+    meanwhile = buffer.rows[buffer.rows[:, 0] > buffer.newest_s - _REST_S]
+    if len(meanwhile) > 1 and turns_clearly(meanwhile[:, 0], meanwhile[:, 1:4]):
+        return ONLY_IMU_TURNS
+    return f"the rig is at rest: {advice}"
 
 
 def _moved_px(before: PointsFrame, after: PointsFrame) -> float:

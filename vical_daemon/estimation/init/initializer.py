@@ -13,7 +13,7 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
-from vical_daemon.estimation.init.attempts import LONG_S, Attempts, RestDetector
+from vical_daemon.estimation.init.attempts import LONG_S, Attempts, RestDetector, rest_in_words
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rig_model import RigModel
@@ -172,7 +172,7 @@ class Initializer:
         waited_for = [name for name in short if name not in rig.silent]
         if not ready or (waited_for and max(spans_s.values()) < max(wait_s, MIN_SPAN_S)):
             if self._rests:
-                return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
+                return _none(rest_in_words(buffer, "turn it about two axes, keep the target in view"), True)
             if ready:
                 return _none(not_in_view(waited_for))
             return _none("collecting the first seconds: move the rig, keep the target in view")

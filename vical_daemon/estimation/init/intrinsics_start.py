@@ -172,7 +172,7 @@ def _without_outliers(
     good = inliers(far)
     if good.all() or good.sum() < MIN_POINTS:
         return view
-    return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
+    return view.only(good)
 
 
 def spread(frames: list[PointsFrame], lens: CameraState, most: int = MOST_VIEWS) -> list[int]:

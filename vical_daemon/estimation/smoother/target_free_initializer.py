@@ -12,7 +12,7 @@ import numpy as np
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
 from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD
-from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts
+from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts, rest_in_words
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import (
@@ -107,7 +107,7 @@ class TargetFreeInitializer:
         self.attempts.tried(end_s)
         self.motion_missing = True
         if _still(usable):
-            return "the camera stands still: move the rig back and forth while turning it"
+            return rest_in_words(buffer, "move it to and fro while turning it")
         return usable
 
     def window(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior | None) -> Window | str:

@@ -51,4 +51,4 @@ def ready(waiting: Sequence[Stamped], begin_s: float, end_s: float) -> Ready:
 def cleaned(frame: PointsFrame) -> PointsFrame:
     """Return the tracks at possible pixels, each identity once."""
     ok = usable_points(frame)
-    return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])
+    return frame.only(ok)

@@ -135,7 +135,7 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
         long = data.t_s[-1] - data.t_s[0] >= ENOUGH_S
         return explain(reference, data.t_s, data.q, reach, start) if long else ""
 
-    reason = refuse_start(start, options)
+    reason = refuse_start(start, options, reference, data.t_s, data.q)
     if start is None or reason:
         return _refused(data, mistake() or reason)
     curve = reference.curve(bias)

@@ -24,7 +24,7 @@ from vical_daemon.estimation.temporal.rotation_start import (
     coarse_start,
     shift_costs,
 )
-from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, camera_turns
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, Turns, camera_turns
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 
@@ -36,6 +36,7 @@ _STEP = 0.02  # between the factors tried; a quarter of it about the best
 _GRID_S = 0.02  # of the shifts tried with each factor
 _LONGEST_S = 12.0  # of the data looked at: with more, the factors would have to be closer
 _TURNS = 80  # enough to tell factors apart
+_CLEARLY = 5.0  # so many times as fast as a sensor that rests another one surely moves
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
 _ROTATION_LOST_RAD = float(np.deg2rad(3.0))  # likewise of a mounting, which by eye is known as well
@@ -43,6 +44,10 @@ _UNITS = {
     np.pi / 180.0: "look like degrees per second (factor 57.3); convert them to rad/s",
     180.0 / np.pi: "look as if divided by 57.3 once too often; they must be in rad/s",
 }  # what rates are multiplied by to be rad/s
+ONLY_IMU_TURNS = (
+    "the IMU turns but the camera does not: is the camera fixed to the IMU, the board fixed in the room, and "
+    "are the images (or poses) new ones?"
+)
 _UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
 
@@ -178,7 +183,7 @@ def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, option
     turns = camera_turns(t_cam, q)
     if len(turns.first) < MIN_PAIRS:
         return Refusal("the camera orientations are too far apart in time: at least 5 a second are needed")
-    rate_cam = float(np.median(turns.angle / (t_cam[turns.second] - t_cam[turns.first])))
+    rate_cam = _rate(turns, t_cam)
     reach = options.search_s + abs(options.timeshift_guess_s)
     near = (t_imu > t_cam[0] - reach) & (t_imu < t_cam[-1] + reach)
     if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
@@ -200,16 +205,24 @@ def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, option
             "turn the rig back and forth about all axes at 20 to 60 deg/s",
             still=True,
         )
-    if rate_cam < MIN_RATE_RPS and swing > 5.0 * MIN_RATE_RPS:
-        return Refusal(
-            "the IMU turns but the camera does not: is the camera fixed to the IMU, are its poses fresh?"
-        )
+    if rate_cam < MIN_RATE_RPS and swing > _CLEARLY * MIN_RATE_RPS:
+        return Refusal(ONLY_IMU_TURNS)
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return Refusal(
             f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither "
             "delay nor mounting about that axis show; turn back and forth, and about other axes"
         )
     return Refusal()
+
+
+def turns_clearly(t_imu: FloatArray, gyro: FloatArray) -> bool:
+    """Whether the gyro shows motion beyond doubt, for most of the time.
+
+    Args:
+        t_imu: Instants, s, shape (n,).
+        gyro: Rates, rad/s, shape (n, 3); their bias does not count.
+    """
+    return float(np.median(_changes(_mean_rates(t_imu, gyro)))) > _CLEARLY * MIN_RATE_RPS
 
 
 def is_constant_rotation(t_imu: FloatArray, gyro: FloatArray) -> bool:
@@ -221,6 +234,19 @@ def is_constant_rotation(t_imu: FloatArray, gyro: FloatArray) -> bool:
     """
     rates = _mean_rates(t_imu, gyro)
     return _is_steady(rates) and float(np.median(np.linalg.norm(rates, axis=1))) > MIN_RATE_RPS
+
+
+def _only_camera_turns(reference: Reference, t_cam: FloatArray, q: FloatArray) -> bool:
+    """Whether the camera turns while the gyro shows next to nothing: a board waved before a rig at rest."""
+    if not isinstance(reference, GyroReference):
+        return False
+    swing = float(np.median(_changes(_mean_rates(reference.t_s, reference.gyro_rps))))
+    return max(_CLEARLY * swing, MIN_RATE_RPS) < _rate(camera_turns(t_cam, q), t_cam)
+
+
+def _rate(turns: Turns, t_cam: FloatArray) -> float:
+    """Median rate of turns, rad/s."""
+    return float(np.median(turns.angle / (t_cam[turns.second] - t_cam[turns.first])))
 
 
 def _is_steady(rates: FloatArray) -> bool:
@@ -240,9 +266,16 @@ def _changes(rates: FloatArray) -> FloatArray:
     return out
 
 
-def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
+def refuse_start(
+    start: Start | None, options: TdIcpOptions, reference: Reference, t_cam: FloatArray, q: FloatArray
+) -> str:
     """Say why no start was found; empty if there is one."""
     reach = f"within {options.search_s:g} s of {options.timeshift_guess_s:g} s"
+    if (start is None or start.agreement < 0.3) and _only_camera_turns(reference, t_cam, q):
+        return (
+            "the camera sees rotation but the IMU does not turn: move the rig, not the board (or are the "
+            "readings of the IMU frozen?)"
+        )
     if start is None:
         return f"no delay {reach} makes the rotations of camera and gyro agree (not the same recording?)"
     if start.agreement < 0.3:

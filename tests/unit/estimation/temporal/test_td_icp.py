@@ -176,6 +176,16 @@ def test_a_rig_that_turns_for_less_than_half_of_the_time_is_no_wrong_unit_of_the
     assert "57.3" not in result.reason
 
 
+@pytest.mark.parametrize("dps", [12.0, 60.0])
+@pytest.mark.parametrize("seconds", [4.0, 10.0])
+def test_a_board_that_is_waved_before_a_rig_at_rest_is_named(dps, seconds):
+    t_imu, gyro, t_cam, R, _, bias = record(4, seconds=seconds, motion=Motion(4, dps))
+    still = bias + np.random.default_rng(4).normal(0, 5.2e-3, gyro.shape)
+    result = td_icp(t_imu, still, t_cam, R)
+    assert result.status == "refused"
+    assert "move the rig, not the board" in result.reason
+
+
 def test_another_recording_is_refused():
     t_imu, gyro, *_ = record(16)
     _, _, t_cam, R, *_ = record(17)
