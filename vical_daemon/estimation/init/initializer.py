@@ -210,7 +210,7 @@ class Initializer:
         poses, stated = result.poses, 1.0 / size
         found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
-            why = "the first seconds do not fit together yet: keep the board in view and moving"
+            why = "the first seconds do not fit together yet: fix the board in the room, move the rig"
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
