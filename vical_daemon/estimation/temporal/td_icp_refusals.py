@@ -287,7 +287,8 @@ def refuse_start(
     if start.mirrored or start.misfit_rad > max(0.5 * start.typical_rad, 0.01):
         return (
             "the rotations agree in size but not in direction: is this the same recording, is the camera "
-            "fixed to the IMU, the board in the room, and are its orientations those of the camera in the world?"
+            "fixed to the IMU and the board in the room, are its orientations those of the camera in the "
+            "world?"
         )
     return ""
 
