@@ -12,6 +12,8 @@ errors are defined such that the position of the camera is linear in them. [docs
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
@@ -37,30 +39,50 @@ def move(
         camera: Whose position is linear in the errors: the one whose image it was.
         jumps: Other columns of errors, changed likewise in place, shape (n, k).
     """
-    columns = [S] if jumps is None else [S, jumps]
-    seen = [camera_moves(state, layout, camera, X) for X in columns]
+    before = CameraMoves.of(state, layout, camera)
+    seen = before.by(S)
+    jumps_seen = None if jumps is None else before.by(jumps)
     for where, T in _turns(state, layout, dx):
         unscented.turn_rows(S, where, T)
         if jumps is not None:
             jumps[where] = T @ jumps[where]
     moved = retract(state, layout, dx)
-    before, after = state.cameras[camera].p_imu_cam, moved.cameras[camera].p_imu_cam
-    goes = camera_moves(state, layout, camera, dx)
-    p_cam = state.p_world_imu + state.R_world_imu @ before + goes
-    moved.p_world_imu = p_cam - moved.R_world_imu @ after
-    more = [was - camera_moves(moved, layout, camera, X) for was, X in zip(seen, columns, strict=True)]
-    if (np.vecdot(more[0], more[0]) > _MOVED**2 * np.vecdot(seen[0], seen[0])).any():
-        for X, m in zip(columns, more, strict=True):
-            X[POSITION] += m
+    after = CameraMoves.of(moved, layout, camera)
+    moved.p_world_imu = state.p_world_imu + before.arm + before.by(dx) - after.arm
+    more = seen - after.by(S)
+    if (np.vecdot(more, more) > _MOVED**2 * np.vecdot(seen, seen)).any():
+        S[POSITION] += more
         S = unscented.lower_root(S)
+        if jumps is not None:
+            jumps[POSITION] += jumps_seen - after.by(jumps)
     return moved, S
 
 
-def camera_moves(state: State, layout: Layout, camera: str, errors: FloatArray) -> FloatArray:
-    """How errors, shape (n,) or (n, k), move a camera in the world, m, shape (3,) or (3, k)."""
-    where, R = layout.cameras[camera].position, state.R_world_imu
-    out: FloatArray = errors[POSITION] - R @ (so3.hat(state.cameras[camera].p_imu_cam) @ errors[ATTITUDE])
-    return out if where is None else out + R @ errors[where]
+class CameraMoves(NamedTuple):
+    """How errors move a camera in the world.
+
+    Attributes:
+        arm: Lever arm in the world, m, shape (3,).
+        by_turn: Derivative by the attitude, m, shape (3, 3).
+        by_arm: Derivative by the lever arm, shape (3, 3).
+        where: The errors of the lever arm; None: it is given.
+    """
+
+    arm: FloatArray
+    by_turn: FloatArray
+    by_arm: FloatArray
+    where: slice | None
+
+    @classmethod
+    def of(cls, state: State, layout: Layout, camera: str) -> CameraMoves:
+        """Those about a state."""
+        R, arm = state.R_world_imu, state.cameras[camera].p_imu_cam
+        return cls(R @ arm, -R @ so3.hat(arm), R, layout.cameras[camera].position)
+
+    def by(self, errors: FloatArray) -> FloatArray:
+        """Moves, m, shape (3,) or (3, k), by errors of shape (n,) or (n, k)."""
+        out: FloatArray = errors[POSITION] + self.by_turn @ errors[ATTITUDE]
+        return out if self.where is None else out + self.by_arm @ errors[self.where]
 
 
 def _turns(state: State, layout: Layout, dx: FloatArray) -> list[tuple[slice, FloatArray]]:

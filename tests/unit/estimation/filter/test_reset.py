@@ -8,7 +8,7 @@ from vical_mocks.cramer_rao.information import BoundOptions
 from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.rotations import exp_so3
 
-from vical_daemon.estimation.filter.reset import camera_moves, move
+from vical_daemon.estimation.filter.reset import CameraMoves, move
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, CameraState, State, make_layout
 
@@ -29,7 +29,7 @@ def wide(seed):
     spread[ATTITUDE] *= 5.0
     for where in layout.cameras.values():
         spread[where.position] *= 50.0
-    spread[POSITION] -= camera_moves(state, layout, "cam0", spread)
+    spread[POSITION] -= CameraMoves.of(state, layout, "cam0").by(spread)
     spread[POSITION] += 3e-5 * rng.standard_normal((3, layout.size))
     return state, layout, np.linalg.cholesky(spread @ spread.T)
 
@@ -44,7 +44,7 @@ def test_a_camera_moves_by_exactly_what_the_errors_say(seed):
     dx = S @ np.random.default_rng(seed + 10).standard_normal(layout.size)
     moved, _ = move(state, layout, S.copy(), dx, "cam0")
     by = camera_m(moved, "cam0") - camera_m(state, "cam0")
-    assert by == pytest.approx(camera_moves(state, layout, "cam0", dx), abs=1e-12)
+    assert by == pytest.approx(CameraMoves.of(state, layout, "cam0").by(dx), abs=1e-12)
     arms = [moved.cameras[n].p_imu_cam - state.cameras[n].p_imu_cam for n in layout.cameras]
     assert arms == [pytest.approx(dx[layout.cameras[n].position]) for n in layout.cameras]
 
@@ -54,15 +54,15 @@ def test_what_is_known_of_the_cameras_position_stays_as_it_was(seed):
     state, layout, S = wide(seed)
     dx = S @ np.random.default_rng(seed + 10).standard_normal(layout.size)
     jumps = S[:, :4].copy()
-    before = camera_moves(state, layout, "cam0", S)
-    jumps_before = camera_moves(state, layout, "cam0", jumps)
+    before = CameraMoves.of(state, layout, "cam0").by(S)
+    jumps_before = CameraMoves.of(state, layout, "cam0").by(jumps)
     moved, after = move(state, layout, S.copy(), dx, "cam0", jumps)
-    now = camera_moves(moved, layout, "cam0", after)
+    now = CameraMoves.of(moved, layout, "cam0").by(after)
     assert now @ now.T == pytest.approx(before @ before.T, rel=1e-6)
-    assert camera_moves(moved, layout, "cam0", jumps) == pytest.approx(jumps_before, rel=1e-9, abs=1e-15)
+    assert CameraMoves.of(moved, layout, "cam0").by(jumps) == pytest.approx(jumps_before, rel=1e-9, abs=1e-15)
     assert (np.triu(after, 1) == 0).all()
     # without, the turn alone would make the position of the camera many times as uncertain
-    kept = camera_moves(moved, layout, "cam0", S)
+    kept = CameraMoves.of(moved, layout, "cam0").by(S)
     assert np.linalg.norm(kept) > 3.0 * np.linalg.norm(before)
 
 
