@@ -146,7 +146,7 @@ def _kept_straight(
     """Added to the positions of sigma points: those of the camera are linear in the errors, see `reset`."""
     arm = known.p_imu_cam
     straight = p_imu_cam - np.cross(arm, errors[:, ATTITUDE])
-    return straight @ state.R_world_imu.T - np.matvec(R, p_imu_cam)
+    return np.asarray(straight @ state.R_world_imu.T - np.matvec(R, p_imu_cam))
 
 
 def bend_by_jitter(

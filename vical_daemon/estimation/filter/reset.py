@@ -40,12 +40,12 @@ def move(
         jumps: Other columns of errors, changed likewise in place, shape (n, k).
     """
     before = CameraMoves.of(state, layout, camera)
-    seen = before.by(S)
-    jumps_seen = None if jumps is None else before.by(jumps)
+    others = [] if jumps is None else [jumps]
+    seen, others_seen = before.by(S), [before.by(X) for X in others]
     for where, T in _turns(state, layout, dx):
         unscented.turn_rows(S, where, T)
-        if jumps is not None:
-            jumps[where] = T @ jumps[where]
+        for X in others:
+            X[where] = T @ X[where]
     moved = retract(state, layout, dx)
     after = CameraMoves.of(moved, layout, camera)
     moved.p_world_imu = state.p_world_imu + before.arm + before.by(dx) - after.arm
@@ -53,8 +53,8 @@ def move(
     if (np.vecdot(more, more) > _MOVED**2 * np.vecdot(seen, seen)).any():
         S[POSITION] += more
         S = unscented.lower_root(S)
-        if jumps is not None:
-            jumps[POSITION] += jumps_seen - after.by(jumps)
+        for X, X_seen in zip(others, others_seen, strict=True):
+            X[POSITION] += X_seen - after.by(X)
     return moved, S
 
 

@@ -222,7 +222,7 @@ def turns_clearly(t_imu: FloatArray, gyro: FloatArray) -> bool:
         t_imu: Instants, s, shape (n,).
         gyro: Rates, rad/s, shape (n, 3); their bias does not count.
     """
-    return float(np.median(_changes(_mean_rates(t_imu, gyro)))) > _CLEARLY * MIN_RATE_RPS
+    return bool(np.median(_changes(_mean_rates(t_imu, gyro))) > _CLEARLY * MIN_RATE_RPS)
 
 
 def is_constant_rotation(t_imu: FloatArray, gyro: FloatArray) -> bool:
@@ -241,7 +241,7 @@ def _only_camera_turns(reference: Reference, t_cam: FloatArray, q: FloatArray) -
     if not isinstance(reference, GyroReference):
         return False
     swing = float(np.median(_changes(_mean_rates(reference.t_s, reference.gyro_rps))))
-    return max(_CLEARLY * swing, MIN_RATE_RPS) < _rate(camera_turns(t_cam, q), t_cam)
+    return bool(max(_CLEARLY * swing, MIN_RATE_RPS) < _rate(camera_turns(t_cam, q), t_cam))
 
 
 def _rate(turns: Turns, t_cam: FloatArray) -> float:
