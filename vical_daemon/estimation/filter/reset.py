@@ -39,22 +39,24 @@ def move(
         camera: Whose position is linear in the errors: the one whose image it was.
         jumps: Other columns of errors, changed likewise in place, shape (n, k).
     """
+    columns = [S] if jumps is None else [S, jumps]
     before = CameraMoves.of(state, layout, camera)
-    others = [] if jumps is None else [jumps]
-    seen, others_seen = before.by(S), [before.by(X) for X in others]
+    p_cam = state.p_world_imu + before.arm + before.by(dx)
     for where, T in _turns(state, layout, dx):
-        unscented.turn_rows(S, where, T)
-        for X in others:
+        unscented.turn_rows(S, where, T)  # turns the columns, too
+        for X in columns[1:]:
             X[where] = T @ X[where]
+        if where is ATTITUDE:
+            before = before._replace(by_turn=before.by_turn @ np.linalg.inv(T))
     moved = retract(state, layout, dx)
     after = CameraMoves.of(moved, layout, camera)
-    moved.p_world_imu = state.p_world_imu + before.arm + before.by(dx) - after.arm
+    moved.p_world_imu = p_cam - after.arm
+    seen = before.by(S)
     more = seen - after.by(S)
     if (np.vecdot(more, more) > _MOVED**2 * np.vecdot(seen, seen)).any():
-        S[POSITION] += more
+        for X in columns:
+            X[POSITION] += before.by(X) - after.by(X)
         S = unscented.lower_root(S)
-        for X, X_seen in zip(others, others_seen, strict=True):
-            X[POSITION] += X_seen - after.by(X)
     return moved, S
 
 

@@ -66,6 +66,18 @@ def test_what_is_known_of_the_cameras_position_stays_as_it_was(seed):
     assert np.linalg.norm(kept) > 3.0 * np.linalg.norm(before)
 
 
+@pytest.mark.parametrize("size", [1e-6, 0.01, 1.0])
+def test_other_columns_of_errors_are_changed_like_the_covariance(size):
+    state, layout, S = wide(1)
+    rng = np.random.default_rng(2)
+    share = rng.standard_normal((layout.size, 3))
+    jumps = S @ share
+    dx = size * S @ rng.standard_normal(layout.size)
+    _, after = move(state, layout, S.copy(), dx, "cam0", jumps)
+    now = np.linalg.solve(after, jumps)
+    np.testing.assert_allclose(now.T @ now, share.T @ share, rtol=1e-8)
+
+
 def test_a_small_step_leaves_the_covariance(recwarn):
     state, layout, S = wide(0)
     moved, after = move(state, layout, S.copy(), 1e-6 * S[:, 0], "cam0")
