@@ -169,7 +169,7 @@ def _from_store(folder: Path) -> Rig:
     from vical_daemon.results.export import rig_from_estimate
     from vical_daemon.results.store import CalibrationStore
 
-    stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
+    stored = CalibrationStore(folder).all()[::-1]
     if not stored:
         raise InputError(f"no calibration is stored in {folder}: nothing has converged yet")
     cameras = {entry.camera: entry.known for entry in stored}

@@ -44,6 +44,7 @@ class StoredCalibration:
         camera: Name of the camera in `estimate`.
         saved_ns: Time of saving, UNIX ns.
         estimate: The estimate with this camera.
+        order: Higher than that of all files that were saved before: the computer's date may have been wrong.
     """
 
     format: int
@@ -52,6 +53,7 @@ class StoredCalibration:
     camera: str
     saved_ns: int
     estimate: CalibrationEstimate
+    order: int = 0
 
     @property
     def known(self) -> CameraEstimate:
@@ -112,11 +114,12 @@ class CalibrationStore:
         Raises:
             StoreError: The estimate is invalid, or the disk refuses; the old calibration is kept.
         """
-        stored = StoredCalibration(_FORMAT, imu_serial, camera_serial, camera, now_ns, estimate)
+        path = self.path(imu_serial, camera_serial)
+        order = 1 + max((_order(other) for other in self.folder.glob("*.json") if other != path), default=-1)
+        stored = StoredCalibration(_FORMAT, imu_serial, camera_serial, camera, now_ns, estimate, order)
         problem = _problem(stored)
         if problem:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
-        path = self.path(imu_serial, camera_serial)
         try:
             atomic_write(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
@@ -149,7 +152,7 @@ class CalibrationStore:
         found = [
             stored for path in sorted(self.folder.glob("*.json")) if (stored := read_stored(path)) is not None
         ]
-        return sorted(found, key=lambda stored: -stored.saved_ns)
+        return sorted(found, key=lambda stored: (-stored.order, -stored.saved_ns))
 
 
 def read_stored(path: Path) -> StoredCalibration | None:
@@ -171,6 +174,18 @@ def read_stored(path: Path) -> StoredCalibration | None:
         _log.warning("%s is not used: %s", path, problem)
         return None
     return stored
+
+
+class _Place(msgspec.Struct):
+    order: int = 0
+
+
+def _order(path: Path) -> int:
+    """Return `StoredCalibration.order` of a file; 0 if it has none."""
+    try:
+        return msgspec.json.decode(read_file(path, _SIZE_LIMIT), type=_Place).order
+    except (OSError, ValueError, RecursionError):
+        return 0
 
 
 def _without_news(document: Any) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 from vical_daemon.bus.messages import merge_calibrations
 from vical_daemon.config.model import Config
 from vical_daemon.config.paths import state_directory
+from vical_daemon.logs.mcap import LogFolder, is_being_written
 from vical_daemon.results.export import ExportError, export, rig_from_estimate
 from vical_daemon.web.state import WebState
 
@@ -47,11 +48,16 @@ class Downloads:
         return f"{format_name}.zip", stream.getvalue()
 
     def newest_log(self) -> Path | None:
-        """Return the newest recording on this computer; one that is being written is readable, too."""
+        """Return the newest recording on this computer; one that is being written is readable, too.
+
+        The times of files tell only of recordings that the recorder did not make: the date may have been wrong.
+        """
         record = self._config.record
         folder = Path(record.directory) if record.directory else state_directory() / "log"
         try:
+            parts = [part for part in folder.glob("*.mcap.part") if is_being_written(part)]
             files = [*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]
-            return max(files, key=lambda path: path.stat().st_mtime, default=None)
+            newest = [max(files, key=lambda path: path.stat().st_mtime)] if files else []
+            return next(iter([*parts, *reversed(LogFolder(folder).segments()), *newest]), None)
         except OSError:
             return None

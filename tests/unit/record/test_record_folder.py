@@ -153,14 +153,42 @@ def test_a_lock_file_that_root_made_is_no_obstacle(tmp_path, monkeypatch):
     second.unlock()
 
 
-def test_runs_of_one_second_are_in_the_order_of_their_files(tmp_path):
-    """Their marks are random: a recorder that takes over at once may have the smaller one."""
-    paths = [
-        tmp_path / f"rig0_20261121T022842Z_{mark}_{index:04d}.mcap"
-        for mark in ("ffffff", "000000")
-        for index in (0, 1)
-    ]
-    for age, path in enumerate(paths):
-        path.write_bytes(b"x")
-        os.utime(path, (1e9 + age, 1e9 + age))
+def record_run(folder: Path, unix_s: int) -> Path:
+    """Leave a segment of 10 bytes, as a recorder that starts at this date would."""
+    log = LogFolder(folder)
+    assert log.lock()
+    path = folder / f"{log.begin_run('rig0', unix_s * 10**9)}_0000.mcap"
+    path.write_bytes(b"x" * 10)
+    log.unlock()
+    return path
+
+
+def test_runs_are_in_the_order_in_which_they_began(tmp_path, monkeypatch):
+    """Whatever their marks, which are random, and their dates.
+
+    A computer without a battery-backed clock is in 1970 again after a start without a network: the recording
+    of today was deleted at once, and last year's kept.
+    """
+    marks = iter(["ffffff", "000000", "dddddd", "222222"])
+    monkeypatch.setattr("secrets.token_hex", lambda size: next(marks))
+    paths = [record_run(tmp_path, unix_s) for unix_s in (1_790_000_000, 1_790_000_000, 30, 20)]
     assert LogFolder(tmp_path).segments() == paths
+    assert LogFolder(tmp_path, quota_bytes=20).enforce_quota() == paths[:2]
+
+
+def test_copied_runs_come_before_listed_ones_and_deleted_ones_are_forgotten(tmp_path):
+    copied = numbered(tmp_path, 0)
+    first = record_run(tmp_path, 30)
+    second = record_run(tmp_path, 20)
+    assert LogFolder(tmp_path).segments() == [copied, first, second]
+    first.unlink()
+    third = record_run(tmp_path, 10)
+    assert LogFolder(tmp_path).segments() == [copied, second, third]
+    assert len((tmp_path / ".recorder.lock").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("damage", [b"", b"\xff\x00nonsense\n"])
+def test_without_its_list_the_dates_count(tmp_path, damage):
+    paths = [record_run(tmp_path, unix_s) for unix_s in (20, 10)]
+    (tmp_path / ".recorder.lock").write_bytes(damage)
+    assert LogFolder(tmp_path).segments() == paths[::-1]

@@ -158,3 +158,14 @@ def test_left_over_temporary_files_do_no_harm(store):
 def test_a_number_of_an_array_library_is_a_number(store):
     store.save("imu", "cam", "cam0", estimate(timeshift_cam_imu_s=np.float64(0.0125)), 1)
     assert store.load("imu", "cam").estimate.cameras["cam0"].timeshift_cam_imu_s == 0.0125
+
+
+def test_the_newest_is_the_one_saved_last_whatever_the_date_was(store):
+    """A computer without a battery-backed clock is in 1970 again after a start without a network."""
+    store.save("a", "old", "cam0", estimate(), 1_790_000_000 * 10**9)
+    store.save("a", "new", "cam0", estimate(), 30 * 10**9)
+    assert [s.camera_serial for s in store.all()] == ["new", "old"]
+    store.save("a", "new", "cam0", estimate(), 31 * 10**9)
+    assert [s.order for s in store.all()] == [1, 0]
+    store.save("a", "old", "cam0", estimate(), 32 * 10**9)
+    assert [s.camera_serial for s in store.all()] == ["old", "new"]

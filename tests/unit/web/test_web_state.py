@@ -29,6 +29,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.wording import guidance_text
+from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.results.export import ExportError
 from vical_daemon.service.liveness import FRESH_S
 from vical_daemon.vision.image_codec import decode_image
@@ -530,3 +531,10 @@ def test_downloads_hold_the_present_result_and_the_newest_log(bus, state, web_fe
         (tmp_path / part).write_bytes(b"x")
         os.utime(tmp_path / part, (1e9 - age, 1e9 - age))
     assert downloads.newest_log().name == "new.mcap.part"
+    for age, part in ((9, "rig_19700101T000100Z_ffffff_0001.mcap"), (5, "rig_19700101T000100Z_ffffff_0000.mcap")):
+        (tmp_path / part).write_bytes(b"x")
+        os.utime(tmp_path / part, (1e9 - age, 1e9 - age))
+    assert downloads.newest_log().name == "rig_19700101T000100Z_ffffff_0001.mcap"  # whatever the files' dates
+    with LogWriter(tmp_path / "rig_19700101T000030Z_000000_0000.mcap") as writer:
+        os.utime(writer.part_path, (30, 30))
+        assert downloads.newest_log() == writer.part_path

@@ -7,17 +7,16 @@ import os
 import re
 import secrets
 import shutil
-import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from vical_daemon.logs.mcap.files import LogError, describe
 from vical_daemon.logs.mcap.recover import Recovery, recover_folder
 
 _LOCK = ".recorder.lock"
 # Only files of this form are ever deleted: rig_YYYYmmddTHHMMSSZ_run_segment.mcap
-_OURS = re.compile(r"[A-Za-z]\w*_(\d{8}T\d{6}Z)_([0-9a-f]{6})_(\d{4,})(\.recovered)?\.mcap")
+_OURS = re.compile(r"[A-Za-z]\w*_(\d{8}T\d{6}Z)_([0-9a-f]{6})_(\d{4,})(\.recovered)?\.mcap(\.part)?")
 
 
 class LogFolder:
@@ -41,6 +40,7 @@ class LogFolder:
         self._lock_fd = -1
         self._finished_bytes: int | None = None  # of all finished segments; None: not known
         self._open_segment: Path | None = None
+        self._runs: list[str] = []  # marks, oldest first; []: not read yet
         self.deleted = 0
 
     @property
@@ -80,7 +80,7 @@ class LogFolder:
 
     def unlock(self) -> None:
         """Let another recorder take over; may be called twice."""
-        self._finished_bytes = None
+        self._finished_bytes, self._runs = None, []
         if self._lock_fd >= 0:
             os.close(self._lock_fd)
             self._lock_fd = -1
@@ -91,23 +91,55 @@ class LogFolder:
         self._finished_bytes = None
         return done
 
+    def begin_run(self, rig: str, unix_ns: int) -> str:
+        """Return the first part of the segment names of a new run, and note that it is the newest.
+
+        The lock file lists the marks of all runs in the order in which they began: a computer without a
+        battery-backed clock may date a run years before the one that it follows. If the list cannot be
+        written (a full disk, another user's file), the dates count at the next start.
+
+        Args:
+            rig: First part of the names.
+            unix_ns: When it begins.
+        """
+        mark = secrets.token_hex(3)
+        here = (_OURS.fullmatch(path.name) for path in self.path.glob("*.mcap*"))
+        present = {match[2] for match in here if match}
+        self._runs = [*(run for run in self._listed() if run in present), mark]
+        data = "".join(f"{run}\n" for run in self._runs).encode()
+        if self.locked:
+            with suppress(OSError):
+                os.pwrite(self._lock_fd, data, 0)  # after a crash here the old end is still behind it
+                os.ftruncate(self._lock_fd, len(data))
+                os.fdatasync(self._lock_fd)
+        begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
+        return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{mark}"
+
+    def _listed(self) -> list[str]:
+        """Marks of the runs in the order in which they began; [] if that is not known."""
+        if not self._runs:
+            with suppress(OSError):
+                text = (self.path / _LOCK).read_text(encoding="ascii", errors="replace")
+                self._runs = re.findall(r"^[0-9a-f]{6}$", text, re.MULTILINE)
+        return self._runs
+
     def segments(self) -> list[Path]:
         """Finished segments of vical, oldest first.
 
-        Their age is that in their names. The time of a file would be that of its recovery or copy, and
-        it steps with the wall clock, which the names do not until the next boot.
+        Runs that the lock file lists are in its order. Others (copied, or of an older version) come before
+        them, by the dates in their names. The time of a file would be that of its recovery or copy, and it
+        steps with the wall clock.
         """
-        dated: list[tuple[str, str, int, Path]] = []
-        oldest: dict[str, int] = {}
+        order: dict[str, int] = {}
+        for run in self._listed():
+            order.setdefault(run, len(order))
+        dated: list[tuple[int, str, str, int, Path]] = []
         for path in self.path.glob("*.mcap"):
             match = _OURS.fullmatch(path.name)
             if match:
-                begin, run, segment, _ = match.groups()
-                dated.append((begin, run, int(segment), path))
-                oldest[run] = min(oldest.get(run, sys.maxsize), _about(path).mtime_ns)
-        # Runs of one second in the order of their files.
-        dated.sort(key=lambda item: (item[0], oldest[item[1]], *item[1:]))
-        return [path for *_, path in dated]
+                begin, run, segment = match.group(1, 2, 3)
+                dated.append((order.get(run, -1), begin, run, int(segment), path))
+        return [path for *_, path in sorted(dated)]
 
     def enforce_quota(self, open_segment: Path | None = None, open_bytes: int = 0) -> list[Path]:
         """Delete the oldest segments until all, with the open one, fit; returns what was deleted.
@@ -120,7 +152,7 @@ class LogFolder:
             self._finished_bytes, self._open_segment = None, open_segment
         if self._finished_bytes is not None and self._finished_bytes + open_bytes <= self._quota_bytes:
             return []
-        sizes = {path: _about(path).size for path in self.segments()}
+        sizes = {path: _size(path) for path in self.segments()}
         total, deleted = sum(sizes.values()), []
         for path in sizes:
             if total + open_bytes <= self._quota_bytes:
@@ -141,12 +173,6 @@ class LogFolder:
         return self.free_bytes() > self._reserve_bytes * (1.1 if resuming else 1.0)
 
 
-def run_name(rig: str, unix_ns: int) -> str:
-    """Return the first part of the segment names of one run; unique even if the clock is set back."""
-    begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
-    return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{secrets.token_hex(3)}"
-
-
 def _open_lock(path: Path) -> int:
     """Open the lock file; for reading if another user (root, once) made it. Over NFS a lock needs writing."""
     try:
@@ -155,15 +181,9 @@ def _open_lock(path: Path) -> int:
         return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 
-class _About(NamedTuple):
-    size: int
-    mtime_ns: int
-
-
-def _about(path: Path) -> _About:
-    """Return size and time of a file; zeros if somebody has just removed it."""
+def _size(path: Path) -> int:
+    """Return the size of a file, bytes; 0 if somebody has just removed it."""
     try:
-        found = path.stat()
+        return path.stat().st_size
     except FileNotFoundError:
-        return _About(0, 0)
-    return _About(found.st_size, found.st_mtime_ns)
+        return 0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vical_daemon.logs.mcap.files import LogError
-from vical_daemon.logs.mcap.folder import LogFolder, run_name
+from vical_daemon.logs.mcap.folder import LogFolder
 from vical_daemon.logs.mcap.writer import LogWriter
 
 _log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class LogSession:
             LogError: The disk refuses.
         """
         self._folder = folder
-        self._run = run_name(rig, now_ns)
+        self._run = folder.begin_run(rig, now_ns)
         self._rotate_s, self._rotate_bytes = rotate_s, rotate_bytes
         self._metadata, self._attachments = metadata, attachments
         self._segment = 0
