@@ -22,6 +22,10 @@ _NEARER = 5.0
 _JUMPS = 0.2
 """Share of such jumps from which on two devices take turns; 0.3 if one is four times as fast, none on real
 recordings of one."""
+_PAUSE_S = 86_400.0
+"""Longest pause within a recording, s: over a day the drift of the clocks is followed (EuRoC with such a hole,
+by hand). Over months its sigma grows until no image fits."""
+_FEW = 0.05  # share of the readings that may lie beyond a longer one, as in `stamps.main_stretch`
 _AT_ONCE = 100_000  # readings that are looked at together: memory
 _COPY = "is one of the files a copy of another?"
 
@@ -40,11 +44,7 @@ def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[st
     if len(samples.t_ns) < 20:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
     rate_hz = _check_imu_rate(name, samples.t_ns)
-    if set_back_s:
-        raise RecordingError(
-            f"{name}: its stamps go back by {set_back_s:.3g} s in the middle: its clock was set, or these "
-            "are two recordings; give the data before and after it as two recordings"
-        )
+    _check_clock_set(name, samples.t_ns, set_back_s)
     _check_one_device(name, samples)
     if mistake := unit_mistake(samples):
         raise RecordingError(f"{name}: {mistake}")
@@ -73,6 +73,22 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
             "is thinned out; take the unsynced one, ..._extract, with 100 Hz)"
         )
     return rate_hz
+
+
+def _check_clock_set(name: str, t_ns: IntArray, set_back_s: float) -> None:
+    """Refuse readings during which the clock of the computer was set, by NTP or GPS."""
+    ahead_s = np.diff(t_ns) * 1e-9
+    at = int(np.argmax(ahead_s)) + 1
+    if set_back_s:
+        step = f"go back by {set_back_s:.3g} s"
+    elif ahead_s[at - 1] > _PAUSE_S and min(at, len(t_ns) - at) > _FEW * len(t_ns):
+        step = f"jump by {ahead_s[at - 1] / 86_400.0:.0f} days"
+    else:
+        return
+    raise RecordingError(
+        f"{name}: its stamps {step} in the middle: its clock was set, or these are two recordings; give the "
+        "data before and after it as two recordings"
+    )
 
 
 def _check_one_device(name: str, samples: ImuArrays) -> None:

@@ -37,6 +37,10 @@ class TdIcpOptions:
     gyro_log_sigma: float = 0.2
 
 
+LONGEST_HOLE_S = 86_400.0
+"""In the readings of a gyro, s: a day. They are interpolated evenly, and memory for years there is not."""
+
+
 def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:
     """Sort, drop what is not a number or stamped twice; a string says why nothing is left."""
     t_s, gyro = np.asarray(t_s, dtype=np.float64), np.asarray(gyro, dtype=np.float64)
@@ -53,7 +57,14 @@ def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
             f"the gyro has {rate_hz:.3g} samples a second by its stamps; at least {SLOWEST_GYRO_HZ:g} are "
             "needed (are its stamps in the right unit, is it the IMU's file?)"
         )
-    return t_s[keep], gyro[keep]
+    t_s, gyro = t_s[keep], gyro[keep]
+    hole_s = float(np.diff(t_s).max())
+    if hole_s > LONGEST_HOLE_S:
+        return (
+            f"the stamps of the gyro jump by {hole_s / 86_400.0:.0f} days: its clock was set; give the data before "
+            "or after it alone"
+        )
+    return t_s, gyro
 
 
 @dataclass(frozen=True)

@@ -197,6 +197,8 @@ def test_too_little_data_is_refused():
     t_imu, gyro, t_cam, R, *_ = record(18)
     assert "at least 12" in td_icp(t_imu, gyro, t_cam[:5], R[:5]).reason
     assert "too few" in td_icp(t_imu[:5], gyro[:5], t_cam, R).reason
+    set_by_ntp = t_imu + 1.4e9 * (np.arange(len(t_imu)) > 5)  # 1 TiB was asked for
+    assert "jump by 16204 days: its clock was set" in td_icp(set_by_ntp, gyro, t_cam, R).reason
     assert "overlap" in td_icp(t_imu, gyro, t_cam + 1000.0, R).reason
     assert td_icp(t_imu, gyro, np.zeros(0), np.zeros((0, 3, 3))).status == "refused"
 
