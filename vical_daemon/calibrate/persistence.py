@@ -11,7 +11,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +35,8 @@ from vical_daemon.service.wall_clock import WallClock
 _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 SERIALS_WITHIN_S = 3.0
+_PATIENCE_S = 1.0
+"""Data may wait so long for the disk, s: a sound one takes 20 ms, and a stalled one up to 20 s."""
 
 _LOGGED = {EventKind.RESUMED, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED}
 """Kinds that are in the log already, by whoever announces them."""
@@ -64,6 +66,7 @@ class CalibrationPersistence:
         self._compared: set[str] = set()
         self._looked_up: set[str] = set()  # cameras for which a stored calibration was looked for
         self._saved_s = -float("inf")
+        self._saving: threading.Thread | None = None
         self.problem = ""  # why the last result could not be stored
         self._status: Status | None = None
         self._announced: list[Event] = []
@@ -187,8 +190,10 @@ class CalibrationPersistence:
             events += self._changes(estimate)
             if self._status is not Status.CONVERGED:
                 notify.event("converged", f"{self._config.rig}: calibration converged", rig=self._config.rig)
-            if time.monotonic() - self._saved_s > SAVE_EVERY_S:
-                self.save(estimate)
+            idle = self._saving is None or not self._saving.is_alive()
+            if idle and time.monotonic() - self._saved_s > SAVE_EVERY_S:
+                self._begin_saving(estimate)
+                self._wait(_PATIENCE_S)
         self._announce_twins()
         for event in events:
             self._journal(event)
@@ -212,19 +217,38 @@ class CalibrationPersistence:
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store an estimate if it has converged."""
-        if estimate is None or estimate.status is not Status.CONVERGED or self._serials.in_doubt:
+        self._wait()
+        if estimate is not None and estimate.status is Status.CONVERGED:
+            self._begin_saving(estimate)
+            self._wait()
+
+    def _begin_saving(self, estimate: CalibrationEstimate) -> None:
+        """Store an estimate in a thread, unless it belongs to other devices: a disk may take seconds."""
+        if self._serials.in_doubt:
             return
         self._saved_s = time.monotonic()
-        before, self.problem = self.problem, ""
-        for name in estimate.cameras:
-            imu, camera = self._pair(name)
-            if imu and camera:
-                try:
-                    self._store.save(imu, camera, name, estimate, self._clock.now_ns())
-                except StoreError as error:
-                    self.problem = str(error)
-        if self.problem and self.problem != before:
-            _log.warning("%s", self.problem)
+        pairs = {name: self._pair(name) for name in estimate.cameras}
+        args = (estimate, {name: pair for name, pair in pairs.items() if all(pair)}, self._clock.now_ns())
+        self._saving = threading.Thread(target=self._write, args=args, name="store", daemon=True)
+        self._saving.start()
+
+    def _write(
+        self, estimate: CalibrationEstimate, pairs: Mapping[str, tuple[str, str]], now_ns: int
+    ) -> None:
+        problem = ""
+        for name, (imu, camera) in pairs.items():
+            try:
+                self._store.save(imu, camera, name, estimate, now_ns)
+            except StoreError as error:
+                problem = str(error)
+        if problem and problem != self.problem:
+            _log.warning("%s", problem)
+        self.problem = problem
+
+    def _wait(self, most_s: float | None = None) -> None:
+        """Wait until nothing is being stored, or for some seconds."""
+        if self._saving is not None:
+            self._saving.join(most_s)
 
     def accept(self, estimate: CalibrationEstimate | None) -> bool:
         """Store an estimate because a person said so, even if it has not converged; announce the outcome.
@@ -234,6 +258,7 @@ class CalibrationPersistence:
         Returns:
             Whether it was stored.
         """
+        self._wait()
         why = self._unacceptable(estimate)
         if not why:
             assert estimate is not None
@@ -358,6 +383,7 @@ class CalibrationPersistence:
                 self.announce(Event(EventKind.OTHER, said=said))
 
     def _load(self, camera: str) -> StoredCalibration | None:
+        self._wait()
         imu_serial, camera_serial = self._pair(camera)
         return self._store.load(imu_serial, camera_serial) if imu_serial and camera_serial else None
 

@@ -26,12 +26,15 @@ from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.logs.mcap import Attachment, LogError, LogFolder, LogSession, describe
 from vical_daemon.record.images import ImageCompressor
 from vical_daemon.record.queue import Arrival, RecordQueue
+from vical_daemon.service import notify
 from vical_daemon.service.device_serials import DeviceSerials
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
 _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
+_SLOW_S = 5.0
+"""A write that takes so long is reported. Cards stall for a second now and then: SD 3.01 allows 0.5 s a write."""
 _KEYS = 512
 _OF_LIMIT = 0.75
 """Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The
@@ -62,6 +65,7 @@ class Recorder:
         self._keys: set[str] = set()
         self._names = {*config.imus, *config.cameras, *_ROLES}
         self._reported: set[str] = set()  # kinds of which a message did not decode
+        self._longest_stall_s = 0.0
         self.messages = 0
         self.refused = 0
         self.malformed = 0
@@ -289,6 +293,31 @@ class Recorder:
             items.append(Attachment("calibration.json", "application/json", text.encode()))
         return items
 
+    def held_up(self, queue: RecordQueue, busy_s: float) -> DiagnosticStatus:
+        """Return the status while a write does not return; looks at nothing on the disk.
+
+        Args:
+            queue: What waits.
+            busy_s: How long it has taken so far, s.
+        """
+        waiting = f"the disk of {self._folder.path} has taken nothing for {busy_s:.0f} s"
+        if busy_s >= _SLOW_S and not self._longest_stall_s:
+            _log.warning("%s; data wait in memory, further stalls are in the status alone", waiting)
+            notify.event("disk_stalled", waiting, level="warning")
+        if busy_s >= _SLOW_S:
+            self._longest_stall_s = max(self._longest_stall_s, busy_s)
+        message = f"{waiting}, {len(queue)} messages wait in memory"
+        values = self._counts(queue) | {"state": "recording" if self._session else "waiting"}
+        return DiagnosticStatus(Level.WARN if busy_s >= _SLOW_S else Level.OK, "record", message, values=values)
+
+    def _counts(self, queue: RecordQueue) -> dict[str, str]:
+        return {
+            "messages": str(self.messages),
+            "queue_depth": str(len(queue)),
+            "dropped": str(sum(queue.dropped.values())),
+            "longest_stall_s": f"{self._longest_stall_s:.0f}",
+        }
+
     def status(self, queue: RecordQueue, lost: int) -> DiagnosticStatus:
         """Return the health of the recorder."""
         session = self._session
@@ -296,9 +325,7 @@ class Recorder:
             "state": "recording" if session else ("waiting" if self._wanted else "stopped"),
             "file": session.path.name if session else "",
             "segment_bytes": str(session.segment_bytes if session else 0),
-            "messages": str(self.messages),
-            "queue_depth": str(len(queue)),
-            "dropped": str(sum(queue.dropped.values())),
+            **self._counts(queue),
             "lost_on_bus": str(lost),
             "refused": str(self.refused),
             "malformed": str(self.malformed),

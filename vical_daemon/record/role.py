@@ -16,6 +16,9 @@ from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
 
 _PERIOD_S = 0.1
+_STUCK_S = 120.0
+"""A disk may hold up a write for so long before the process is restarted, which costs what waits in memory:
+Linux calls a task that waits longer hung (hung_task_timeout_secs)."""
 
 
 def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
@@ -34,6 +37,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     folder = LogFolder(path, quota_bytes=config.record.quota_bytes, reserve_bytes=config.record.reserve_bytes)
     recorder, queue = Recorder(config, folder, clock), RecordQueue()
     status = StatusSender(config.rig, "record", bus, clock)
+    status.repeat_while_busy(_STUCK_S, lambda busy_s: [recorder.held_up(queue, busy_s)])
 
     def take(sample: Sample) -> None:
         item = arrival(sample, clock)
@@ -55,4 +59,4 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     for item in queue.take(0):
         recorder.write(item)
     recorder.close()
-    status.tick(lambda: [recorder.status(queue, subscription.dropped)], force=True)
+    status.finish(lambda: [recorder.status(queue, subscription.dropped)])

@@ -20,6 +20,9 @@ CLOCK_STEP_S = 0.1
 _log = logging.getLogger(__name__)
 
 
+Meanwhile = Callable[[float], list[DiagnosticStatus]]
+
+
 class _ClockSteps:
     """Announces steps of the system clock, once in a process whatever the number of its roles."""
 
@@ -86,27 +89,28 @@ class StatusSender:
         self._finished.set()
         self.tick(statuses, force=True)
 
-    def repeat_while_busy(self, stuck_s: float) -> None:
-        """Publish the last status again, in a thread, while a turn of the role's loop takes over a second.
+    def repeat_while_busy(self, stuck_s: float, meanwhile: Meanwhile | None = None) -> None:
+        """Publish a status, in a thread, while a turn of the role's loop takes over a second.
 
-        A start takes seconds on a small computer, and the role is alive.
+        A start takes seconds on a small computer, and a slow disk may hold up a write: the role is alive.
 
         Args:
             stuck_s: A turn longer than this is reported as stuck, s.
+            meanwhile: Makes the status from how long the turn has taken, s; None: the last one again.
         """
-        name = f"status/{self._role}"
-        threading.Thread(target=self._repeat, args=(stuck_s,), name=name, daemon=True).start()
+        name, args = f"status/{self._role}", (stuck_s, meanwhile)
+        threading.Thread(target=self._repeat, args=args, name=name, daemon=True).start()
 
     def pause(self) -> None:
         """Repeat nothing until the next `tick`: somebody else reports for the role."""
         self._last = []
 
-    def _repeat(self, stuck_s: float) -> None:
+    def _repeat(self, stuck_s: float, meanwhile: Meanwhile | None) -> None:
         while not self._finished.wait(STATUS_PERIOD_S):
             busy_s, last = time.monotonic() - self._ticked_s, self._last
             if not last or busy_s < STATUS_PERIOD_S:
                 continue
-            first, *others = last
+            first, *others = last if meanwhile is None else meanwhile(busy_s)
             if busy_s > stuck_s:
                 first = replace(first, level=Level.STALE, message=f"stuck: at one step for {busy_s:.0f} s")
             self._publish([first, *others])

@@ -321,7 +321,7 @@ class PageServer:
 
     async def _log_file(self, request: web.Request) -> web.StreamResponse:
         self._check_token(request, "a download")
-        path = None if self._downloads is None else self._downloads.newest_log()
+        path = None if self._downloads is None else await asyncio.to_thread(self._downloads.newest_log)
         if path is None:
             raise web.HTTPNotFound(text="there is no log on this computer; is recording on?")
         return web.FileResponse(path, headers=_attached(path.name))

@@ -87,6 +87,28 @@ def test_a_converged_calibration_is_the_prior_after_a_restart(config: Config) ->
     assert prior.intrinsics == (500, 500, 320, 240)
 
 
+def test_a_disk_that_stalls_does_not_hold_up_the_estimator(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An SD card may take 20 s to sync a file, and one was synced every minute while all images waited."""
+    answers, save = threading.Event(), CalibrationStore.save
+
+    def stalled(*args: Any) -> Path:
+        assert answers.wait(30.0)
+        return save(*args)
+
+    monkeypatch.setattr(CalibrationStore, "save", stalled)
+    monkeypatch.setattr("vical_daemon.calibrate.persistence.SAVE_EVERY_S", 0.0)
+    persistence = _later(config)
+    for x_m in (0.08, 0.09):  # the second finds the first one waiting
+        persistence.watch(_estimate(_camera(p_m=(x_m, 0.02, -0.03))))
+    assert _later(config).priors()["cam0"].T_imu_cam is None
+    answers.set()
+    persistence.close(_estimate(_camera(p_m=(0.1, 0.02, -0.03))))
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is not None and prior.T_imu_cam[1][0] == 0.1
+
+
 def test_it_is_not_used_for_another_camera(config: Config) -> None:
     _remember(config, _camera())
     assert _later(config, camera_serial="C2").priors()["cam0"].T_imu_cam is None

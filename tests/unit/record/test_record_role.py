@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import threading
@@ -62,6 +63,13 @@ def numbers(path: Path) -> list[int]:
         for x in LogReader(path).messages()
         if x.channel.topic == "/" + IMU
     ]
+
+
+def wait_until(condition) -> None:
+    begin_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() < begin_s + 30.0
+        time.sleep(0.02)
 
 
 def command(recorder: Recorder, word: str) -> None:
@@ -480,3 +488,39 @@ def test_invented_keys_leave_room_for_those_of_the_rig(make, tmp_path):
         feed(recorder, 1, i, key=topics.IMU.key("rig0", f"junk{i}"))
     feed(recorder, 1, key=topics.IMU.key("rig0", "imu7"))
     assert recorder.messages == 512 + 1
+
+
+def test_a_disk_that_stalls_is_reported_and_loses_nothing(tmp_path, monkeypatch, caplog):
+    """On a robot the watchdog killed the recorder after 15 s, and what waited in memory was lost."""
+    answers, write = threading.Event(), os.write
+
+    def stalled(descriptor: int, data: bytes) -> int:
+        assert answers.wait(30.0)
+        return write(descriptor, data)
+
+    monkeypatch.setattr("vical_daemon.record.recorder._SLOW_S", 0.2)
+    monkeypatch.setattr("vical_daemon.service.health.STATUS_PERIOD_S", 0.1)
+    bus, stop = LocalBus(), threading.Event()
+    heard = []
+    bus.subscribe(
+        topics.STATUS.key("rig0", "record"), lambda s: heard.append(m.decode_diagnostics(s.payload).statuses[0])
+    )
+    log = tmp_path / "log"
+    role = threading.Thread(target=record.run, args=(settings(log), bus, stop), kwargs={"clock": CLOCK})
+    role.start()
+    try:
+        wait_until(lambda: any("recording" in status.message for status in heard))
+        monkeypatch.setattr(os, "write", stalled)
+        for i in range(200):
+            bus.publish(IMU, m.encode_imu(i + 1, "imu0", (float(i), 0.1, 0.2), (0.0, 0.0, 9.8)))
+            time.sleep(0.01)
+        wait_until(lambda: "messages wait in memory" in heard[-1].message and heard[-1].level is m.Level.WARN)
+        assert heard[-1].values["state"] == "recording"
+    finally:
+        answers.set()
+        stop.set()
+        role.join(30.0)
+    assert heard[-1].level is m.Level.OK and heard[-1].values["dropped"] == "0"
+    assert sum(f"the disk of {log} has taken nothing for" in r.getMessage() for r in caplog.records) == 1
+    (path,) = LogFolder(log).segments()
+    assert numbers(path) == list(range(200))
