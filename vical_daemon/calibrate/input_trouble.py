@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from vical_daemon.bus.messages import DiagnosticsMessage, DiagnosticStatus, Level
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.service.liveness import FRESH_S
@@ -25,6 +26,10 @@ WRONG_TARGET = "wrong_target"
 """Value of a detector's status: what its images contradict in the target file, one line."""
 LOOKS_FOR = "looks_for"
 """Likewise: the board that it found in none of many images, in words."""
+_REFUSED = 0.01
+"""Share of refused readings from which on they are the IMU's trouble. Bytes damaged on a serial line pass its
+checksum once in 65 536 times."""
+_LEAST, _LATEST = 200, 2000  # readings of which the share is taken
 _NOTHING_YET = (Status.WAITING, Status.INITIALISING)
 
 
@@ -64,17 +69,47 @@ class InputTrouble:
             self._devices[f"camera/{name}"] = _Device(max(FRESH_S, _PERIODS / rate_hz))
         self._said: dict[str, str] = {}  # what is wrong with a device or its detector, by name
         self._refused: dict[str, str] = {}  # why the last message that came cannot be true
+        self._why_refused, self._counts = "", [0, 0]  # of the imu's latest readings: used, refused
+        self._units_announced = False
         self._wrong_target: dict[str, str] = {}  # what images contradict in the target file, by camera
         self._looks_for: dict[str, str] = {}  # the board that was found in no image, by camera
         self._looked_s: float | None = None
 
-    def imu_came(self, *, new: bool) -> None:
+    def imu_came(self, count: int = 1, *, new: bool) -> None:
         """Readings came; `new`: not only the same one again."""
         self._came(self._imu, new=new)
+        self._count(0, count)
 
     def imu_refused(self, why: str) -> None:
         """A reading came that no device measures; `why`: one line."""
         self._refused[self._imu] = f"its readings are refused: {why}"
+        self._why_refused = why
+        self._count(1, 1)
+
+    def _count(self, which: int, count: int) -> None:
+        self._counts[which] += count
+        if sum(self._counts) > _LATEST:
+            self._counts = [n // 2 for n in self._counts]
+
+    @property
+    def partly_refused(self) -> str:
+        """Say that some of the imu's latest readings are refused, and why; empty: hardly any are."""
+        total = sum(self._counts)
+        share = self._counts[1] / max(total, 1)
+        if share < _REFUSED or total < _LEAST:
+            return ""
+        name = self._imu.partition("/")[2]
+        return f"{100.0 * share:.0f} % of {name}'s readings are refused: {self._why_refused}"
+
+    def causes(self, events: list[Event]) -> list[Event]:
+        """Return events with the cause, once, in place of the gaps that refused readings leave."""
+        refused = self.partly_refused
+        if refused:
+            events = [event for event in events if event.kind is not EventKind.IMU_GAP]
+            events += [Event(EventKind.IMU_UNITS, said=refused)]
+        kept = [e for e in events if e.kind is not EventKind.IMU_UNITS or not self._units_announced]
+        self._units_announced |= any(event.kind is EventKind.IMU_UNITS for event in kept)
+        return kept
 
     def image_came(self, camera: str, *, new: bool) -> None:
         """What was found in an image came; `new`: not the same as in the one before, to the last bit."""
@@ -162,7 +197,8 @@ class InputTrouble:
         would not be seen. A camera of which nothing is known waits, whatever is known of the others.
         """
         missing = self.of_camera(camera)
-        wrong = self._wrong_target.get(camera, "")
+        refused = "" if missing else self.partly_refused
+        wrong = "; ".join(filter(None, (refused, self._wrong_target.get(camera, ""))))
         board = self._looks_for.get(camera, "") if estimate.status is Status.WAITING else ""
         if board and not missing and not wrong:
             text = f"{estimate.reason}; {camera} looks for {board}, as the target file says"

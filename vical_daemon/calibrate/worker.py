@@ -205,7 +205,7 @@ class EstimateRole:
                 self._trouble.image_came(item.camera, new=self._repeated("images") == images_repeated)
                 self._report(self.estimator.process())
         if readings:
-            self._trouble.imu_came(new=self._repeated("imu") < repeated + readings)
+            self._trouble.imu_came(readings, new=self._repeated("imu") < repeated + readings)
 
     def _repeated(self, what: str) -> int:
         """Readings (``imu``) or ``images`` so far that were the one before once more."""
@@ -221,6 +221,7 @@ class EstimateRole:
             return []
         self._next_s = now_s + self._period_s
         estimate = self.estimator.estimate()
+        estimate = replace(estimate, events=self._trouble.causes(estimate.events))
         self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
         told = {name: self._trouble.told(estimate, name) for name in self.config.calibration_cameras}
         messages = calibration_messages(self.config, told) + self._predictions.messages()

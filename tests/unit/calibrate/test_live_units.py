@@ -94,6 +94,26 @@ def test_readings_that_are_refused_are_not_called_missing_alone(change, says):
     assert re.search(f"nothing from imu0 yet, after .* s: {says}", last.reason)
 
 
+@pytest.mark.parametrize("rate_rps", [1.5, 2.0, 3.0])
+def test_readings_in_degrees_that_are_refused_in_part_are_named_and_not_called_gaps(rate_rps):
+    """Above 70 of them a second; the others look like a gyro in rad/s with holes."""
+    gyro, force = readings(14.0, rate_rps)
+    estimates = published(np.rad2deg(gyro), force)
+    assert re.search(r"its readings are refused|% of imu0's readings are refused", estimates[-1].reason)
+    assert "is it in deg/s?" in estimates[-1].reason
+    events = [event.kind for estimate in estimates for event in estimate.events]
+    assert events == [EventKind.IMU_UNITS]
+
+
+@pytest.mark.parametrize("at", [20, 700])
+def test_one_damaged_reading_is_not_spoken_of(at):
+    gyro, force = readings(12.0)
+    gyro[at] = 1e6
+    estimates = published(gyro, force)
+    assert not [event for estimate in estimates for event in estimate.events]
+    assert "refused" not in estimates[-1].reason
+
+
 def test_the_right_units_are_not_spoken_of():
     for rate_rps in (0.0, 0.05, 0.5, 3.0):
         estimates = published(*readings(12.0, rate_rps))

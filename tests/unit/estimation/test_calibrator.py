@@ -71,6 +71,14 @@ def done(run):
     return calibrate(run)
 
 
+def test_an_accelerometer_of_the_opposite_sign_is_named():
+    """Live, too: "check the target's size in its YAML" was all that was said, and then to go on moving."""
+    free = {"cam0": CameraPrior((640, 480), (500.0, 500.0, 320.0, 240.0))}
+    estimate = calibrate(simulate(9, 12.0), CalibrationOptions(), free, force_scale=-1.0).estimate()
+    assert estimate.status is Status.INITIALISING and not estimate.cameras
+    assert "the accelerometer reports gravity instead of specific force" in estimate.reason
+
+
 @pytest.mark.parametrize("seed", [5, 7])
 def test_images_that_are_blurred_now_and_then_are_no_bump(seed):
     """With one noise for all images both are started anew."""

@@ -21,6 +21,9 @@ _TURNS_WITH_GYRO = 0.2
 """Correlation, see `gyro_scale`, of a vector that stands still in the world: 0.5 and more on recordings
 that are moved by hand; below 0 with gravity removed."""
 _SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
+_VIOLENT_RPS = 2.0
+"""Median rate of a rig in violent hands. Such a one reads 0.3 to 1.1 g for each rad/s, and 2.5 to 11 m/s^2 with
+gravity removed (`hand_motion` of 200 deg/s, 12 seeds, windows of 5 s)."""
 _LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
 _STANDS = 0.05  # of the change that the gyro's rates mean
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
@@ -85,6 +88,8 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
         return ""  # violent motion
     elif constant := constant_channels(samples):
         text = constant
+    elif gyro > _VIOLENT_RPS and 0.6 < median < gyro:  # in both cases the motion outweighs gravity
+        text = f"it looks like g (multiply by {STANDARD_GRAVITY_MPS2}), or gravity is removed: move it more slowly"
     elif median < 0.6 or (low < _MOVES * median and correlation < _TURNS_WITH_GYRO):
         text = "gravity seems to be removed: record the accelerometer as it is"
     elif 0.6 < median < 1.6:

@@ -11,16 +11,47 @@ side from which the board is seen distinguishes the two.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import CameraPath, force_misfits
+from vical_daemon.estimation.init.attempts import LONG_S
+from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import CameraState
 
 _LONGEST_S = 60.0  # of the poses that are looked at: the cost grows with the square
 _POSE_SIGMA = 1e-3  # m and rad, of a board that fills the image: weighs the priors of lever arm and bias
 _BETTER = 0.5  # residual over that of the axes as they are: a wrong sign or swap changes it several times
 _AXES = "xyz"
+
+
+def mistaken_axes(
+    poses: Sequence[TargetPose], cameras: Mapping[str, CameraState], buffer: ImuBuffer
+) -> str:
+    """Name the mistake that explains why no start fits; as `explain_accelerometer`.
+
+    Args:
+        poses: By the rotations, in order for each camera.
+        cameras: Mounting and time shift, by the rotations.
+        buffer: Inertial readings.
+    """
+    first = poses[0].frame.camera
+    of_it = [pose for pose in poses if pose.frame.camera == first]
+    t_cam_s = np.array([pose.t_cam_s for pose in of_it])
+    if t_cam_s[-1] - t_cam_s[0] < LONG_S:
+        return ""  # more data may be all that is missing
+    return explain_accelerometer(
+        buffer.rows[:, 0],
+        buffer.rows[:, 4:7],
+        t_cam_s + cameras[first].timeshift_s,
+        np.array([pose.R_target_cam for pose in of_it]),
+        np.array([pose.p_target_cam for pose in of_it]),
+        cameras[first].R_imu_cam,
+    )
 
 
 def explain_accelerometer(

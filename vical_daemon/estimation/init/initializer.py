@@ -13,6 +13,7 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
+from vical_daemon.estimation.init.accelerometer_check import mistaken_axes
 from vical_daemon.estimation.init.attempts import LONG_S, Attempts, RestDetector, rest_in_words
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
@@ -211,6 +212,7 @@ class Initializer:
         found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
             why = "the first seconds do not fit together yet: fix the board in the room, move the rig"
+            why = mistaken_axes(poses, state.cameras, buffer) or why
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)

@@ -11,6 +11,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import nearest_rotation
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import over_intervals, products, strapdown
+from vical_daemon.estimation.init.accelerometer_check import mistaken_axes
 from vical_daemon.estimation.init.linear_start import LinearMotion, LinearStart, linear_start, still_axes
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
@@ -130,7 +131,8 @@ def motion_start(
             size, still = float(np.linalg.norm(linear.gravity)), axes
             state = _state_at(inside[0], camera, linear, gyro_bias, cameras, options)
     if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
-        return StartResult(None, _GRAVITY.format(size, options.gravity_mps2), size=other)
+        why = "" if other else mistaken_axes(next(iter(known.values())).poses, cameras, buffer)
+        return StartResult(None, why or _GRAVITY.format(size, options.gravity_mps2), size=other)
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used, size=other)
 
 

@@ -62,3 +62,12 @@ def test_special_motion_is_accepted(make, seed):
 def test_a_wrong_unit_is_named(dps, change, says):
     t_s, gyro, force = readings(trajectory.hand_motion(1, dps))
     assert says in said(t_s, *change(gyro, force))[-1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_g_in_violent_motion_is_not_called_removed_gravity_alone(seed):
+    """At 200 deg/s 1.7 g and no gravity at all turn alike: both are named."""
+    t_s, gyro, force = readings(trajectory.hand_motion(seed, 200.0))
+    assert all("looks like g" in text for text in said(t_s, gyro, force / 9.80665))
+    t_s, gyro, force = readings(trajectory.hand_motion(seed, 100.0))
+    assert all("looks like g" in text for text in said(t_s, gyro, force / 9.80665))
