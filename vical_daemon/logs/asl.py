@@ -38,9 +38,9 @@ from vical_daemon.logs.model import (
 )
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back_s
-from vical_daemon.logs.table_text import titles
+from vical_daemon.logs.table_text import FIRST_ROW, titles
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
-from vical_daemon.logs.two_tables import one_table, read_sensor, two_tables
+from vical_daemon.logs.two_tables import SensorTable, one_table, two_sensors
 from vical_daemon.logs.united_imu import forces_at
 from vical_daemon.logs.what_is_there import images_in, what_is_there
 
@@ -158,25 +158,24 @@ class AslRecording(Recording):
         if (table := one_table(root)) is not None:
             self.warnings.append(f"{_UNITED}: {table.name} is read, whose title names all six axes")
             return [self._read_imu(table, _UNITED)]
-        pair = two_tables(root)
-        return [] if pair is None else [self._read_two(*pair)]
+        pair = two_sensors(root)
+        return [] if pair is None else [self._one_of(*pair)]
 
-    def _read_two(self, gyro_path: Path, accel_path: Path) -> _Source:
-        """Make one IMU of the tables of a gyro and an accelerometer."""
-        gyro, accel = read_sensor(gyro_path), read_sensor(accel_path)
+    def _one_of(self, gyro: SensorTable, accel: SensorTable) -> _Source:
+        """Make one IMU of a gyro and an accelerometer, which were read apart."""
         rows = np.empty(len(gyro.t_ns), _IMU_ROW)
         rows["t"], rows["values"][:, :3] = gyro.t_ns, gyro.axes
         rows["values"][:, 3:] = forces_at(gyro.t_ns, accel.t_ns, accel.axes)
         within = np.flatnonzero(np.isfinite(rows["values"][:, 3]))
         if not len(within):
             raise RecordingError(
-                f"{gyro_path} and {accel_path.name} were not recorded at the same time by their stamps"
+                f"{gyro.path} and {accel.path.name} were not recorded at the same time by their stamps"
             )
         rows = rows[within[0] : within[-1] + 1]
         self._note_stamps(_UNITED, float(np.hypot(gyro.sigma_s, accel.sigma_s)), gyro.report)
-        used = f"the gyro of {gyro_path.name}, and the accelerometer of {accel_path.name}"
+        used = f"the gyro of {gyro.path.name}, and the accelerometer of {accel.path.name}"
         self.warnings.append(f"{_UNITED}: {used} interpolated to its stamps")
-        return self._imu_source(rows, _UNITED, gyro_path)
+        return self._imu_source(rows, _UNITED, gyro.path)
 
     def _read_imu(self, path: Path, name: str) -> _Source:
         rows = self._load(path, name, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
@@ -286,6 +285,8 @@ class AslRecording(Recording):
         named = columns_by_title(title) if dtype == _IMU_ROW else None
         if named is not None and not named.in_order:
             text = reordered(text, named)
+            if FIRST_ROW.search(text) is None:
+                raise RecordingError(f"{path}: its column of stamps has no numbers; log them, too")
             self.warnings.append(
                 f"{sensor}: its title names the columns in another order; read by their names"
             )

@@ -23,8 +23,8 @@ _JUMPS = 0.2
 """Share of such jumps from which on two devices take turns; 0.3 if one is four times as fast, none on real
 recordings of one."""
 _PAUSE_S = 86_400.0
-"""Longest pause within a recording, s: over a day the drift of the clocks is followed (EuRoC with such a hole,
-by hand). Over months its sigma grows until no image fits."""
+"""Longest pause within a recording, s: over a day the drift of the clocks is followed (EuRoC with such a
+hole, by hand). Over months its sigma grows until no image fits."""
 _FEW = 0.05  # share of the readings that may lie beyond a longer one, as in `stamps.main_stretch`
 _AT_ONCE = 100_000  # readings that are looked at together: memory
 _COPY = "is one of the files a copy of another?"

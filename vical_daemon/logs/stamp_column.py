@@ -29,6 +29,11 @@ _COARSE_NS = 100_000
 is 0.025 px, a tenth of what corners have."""
 
 
+_XSENS, _XSENS_STEP = "sampletimefine", 5000
+"""A counter of Xsens: an MTi counts 0.1 ms, a DOT us. So step by step it grows by less than this (2 Hz of an
+MTi, 200 Hz of a DOT, which has at most 120), or by more."""
+
+
 class StampColumn(NamedTuple):
     """The stamps of a table.
 
@@ -60,6 +65,10 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
         StampError: One does not fit into 64 bits.
     """
     slowest, fastest, usual = _IMU_HZ if imu else _CAMERA_HZ
+    if _XSENS in title.lower() and len(values) > 1:
+        ticks = np.array(values, dtype=np.float64)
+        tenths = float(np.median(np.diff(ticks))) < _XSENS_STEP
+        title, values = "us", np.round(ticks * (100 if tenths else 1)).astype(np.int64)
     if isinstance(values, np.ndarray):
         distinct: list[int] = np.unique(values).tolist()
         unit = unit_by_spacing(distinct, slowest, fastest, usual)

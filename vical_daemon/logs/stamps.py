@@ -111,7 +111,8 @@ def not_a_stamp(text: str) -> str:
     """Say that a stamp cannot be read, and of dates how they are written."""
     text = text.strip()[:40]
     dated = re.search(r"\d[-:/.]\d+[-:/.]\d", text)
-    advice = "; write dates like 2026-01-31T12:00:00.123 (ISO 8601), or as ns since 1970" if dated else ""
+    advice = "; day or month first? nothing shows it" if re.match(r"\d\d?/\d\d?/\d{4}", text) else ""
+    advice += "; write dates like 2026-01-31T12:00:00.123 (ISO 8601), or as ns since 1970" if dated else ""
     return f"its stamp is no number: {text!r}{advice}"
 
 

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 IN_DEGREES = "its title gives the gyro in degrees; rad/s are expected: multiply by pi/180, correct the title"
 _IN_ORDER = tuple(range(7))
-_IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|ang\w*acc|accura")
+_IGNORED = re.compile(r"covar|std|sigma|bias|mag|orient|quat|gravity|free|user|ang\w*acc|accura")
 _GYRO = re.compile(r"gyr|omega|ang\w*\W?(vel|rate|speed)|rot\w*\W?(vel|rate|speed)|^[wg]_?(rs_s)?_?[xyz]$")
 _ACCEL = re.compile(r"acc|specific|force|^a_?(rs_s)?_?[xyz]$|^f_?[xyz]$")
 _DEGREES = re.compile(r"deg|dps|°")
 _STAMP = re.compile(r"time|stamp|^ts?$|^ts_|^t_|^cts$")
+_AROUND = ' #%\t\r\n"\ufeff'
 _WHOLE, _REST = re.compile(r"stamp\W?secs?$"), re.compile(r"stamp\W?nsecs?$|stamp\W?nanosecs?$")
 
 
@@ -112,9 +113,15 @@ def reordered(text: bytes, columns: Columns) -> bytes:
 
 
 def _plain(name: str) -> str:
-    """Return a column's name in lower case, without its unit and what `rostopic echo -p` puts before it."""
-    name = re.sub(r"[\[(].*", "", name.lower()).strip(' #%\t\r\n"\ufeff')
-    return name.removeprefix("field.")
+    """Return a column's name in lower case, without its unit and what `rostopic echo -p` puts before it.
+
+    PX4 counts the axes, and DJI the sensors.
+
+    >>> _plain("gyro_rad[2]"), _plain("IMU_ATTI(0):accelX"), _plain("field.ax [m/s^2]")
+    ('gyro_radz', 'imu_atti:accelx', 'ax')
+    """
+    name = re.sub(r"\[([012])\]$", lambda axis: "xyz"[int(axis[1])], name.lower().strip(_AROUND))
+    return re.sub(r"[\[(][^\])]*[\])]|[\[(].*", "", name).strip(_AROUND).removeprefix("field.")
 
 
 def _stamp_of(names: list[str], axes: list[int]) -> tuple[int, int | None]:

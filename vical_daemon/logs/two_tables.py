@@ -14,6 +14,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.asl_tables import head_of, is_table, load_table, read_table
+from vical_daemon.logs.labelled_rows import labelled_file, tables_of
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamp_column import column_ns
 from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers
@@ -37,12 +38,14 @@ class SensorTable(NamedTuple):
     """One sensor of a table.
 
     Attributes:
+        path: Its file; of records that name their sensor with that name behind it.
         t_ns: In the order of the table, ns, shape (n,).
         axes: Readings, shape (n, 3).
         report: On its stamps, for people; empty: nothing.
         sigma_s: By how much all stamps may be off together, s, see `column_ns`.
     """
 
+    path: Path
     t_ns: IntArray
     axes: FloatArray
     report: str
@@ -57,6 +60,25 @@ def two_tables(root: Path) -> tuple[Path, Path] | None:
     """
     places = (root, root / "imu0")
     tables = [p for place in places if place.is_dir() for p in sorted(place.iterdir()) if is_table(p)]
+    return _pair(tables)
+
+
+def two_sensors(root: Path) -> tuple[SensorTable, SensorTable] | None:
+    """Read gyro and accelerometer of a folder; None: they are not there, or not clear.
+
+    Raises:
+        RecordingError: They cannot be read.
+    """
+    if (pair := two_tables(root)) is not None:
+        return read_sensor(pair[0]), read_sensor(pair[1])
+    file = labelled_file(root)
+    tables = {file / name: text for name, text in tables_of(file).items()} if file is not None else {}
+    if (pair := _pair(list(tables))) is None:
+        return None
+    return _sensor_of(tables[pair[0]], pair[0]), _sensor_of(tables[pair[1]], pair[1])
+
+
+def _pair(tables: list[Path]) -> tuple[Path, Path] | None:
     gyro, accel = (_named(tables, *x) for x in ((_GYRO, _ACCEL), (_ACCEL, _GYRO)))
     return None if gyro is None or accel is None else (gyro, accel)
 
@@ -81,7 +103,10 @@ def read_sensor(path: Path) -> SensorTable:
     Raises:
         RecordingError: It is none, or its title says that rates are in degrees.
     """
-    text = read_table(path)
+    return _sensor_of(read_table(path), path)
+
+
+def _sensor_of(text: bytes, path: Path) -> SensorTable:
     lines = titles(text)
     title = next(filter(axes_by_title, lines), "".join(lines[:1]))
     if names_degrees(title):
@@ -101,7 +126,7 @@ def read_sensor(path: Path) -> SensorTable:
         text_ = not_a_stamp(str(rows["t"][error.index]))
         raise RecordingError(f"{path}: row {error.index + 1} of the data: {text_}") from None
     good = np.isfinite(rows["axes"]).all(axis=1)
-    return SensorTable(column.t_ns[good], rows["axes"][good], column.report, column.sigma_s)
+    return SensorTable(path, column.t_ns[good], rows["axes"][good], column.report, column.sigma_s)
 
 
 def _stamp_is_last(text: bytes) -> bool:

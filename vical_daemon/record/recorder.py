@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
 _SLOW_S = 5.0
-"""A write that takes so long is reported. Cards stall for a second now and then: SD 3.01 allows 0.5 s a write."""
+"""A write that takes so long is reported, s. Some cards stall for a second now and then."""
 _KEYS = 512
 _OF_LIMIT = 0.75
 """Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The
@@ -308,7 +308,8 @@ class Recorder:
             self._longest_stall_s = max(self._longest_stall_s, busy_s)
         message = f"{waiting}, {len(queue)} messages wait in memory"
         values = self._counts(queue) | {"state": "recording" if self._session else "waiting"}
-        return DiagnosticStatus(Level.WARN if busy_s >= _SLOW_S else Level.OK, "record", message, values=values)
+        level = Level.WARN if busy_s >= _SLOW_S else Level.OK
+        return DiagnosticStatus(level, "record", message, values=values)
 
     def _counts(self, queue: RecordQueue) -> dict[str, str]:
         return {

@@ -50,7 +50,7 @@ class Downloads:
     def newest_log(self) -> Path | None:
         """Return the newest recording on this computer; one that is being written is readable, too.
 
-        The times of files tell only of recordings that the recorder did not make: the date may have been wrong.
+        The times of files count only for recordings that the recorder did not make: a date may be wrong.
         """
         record = self._config.record
         folder = Path(record.directory) if record.directory else state_directory() / "log"

@@ -268,9 +268,9 @@ def test_dates_of_another_form_are_shown_with_what_to_write(tmp_path, write_asl)
     folder = write_asl(tmp_path / "a")
     path = folder / "mav0/imu0/data.csv"
     title, *rows = path.read_text().splitlines()
-    dated = [f"27.11.2026 09:00:{k / 100:09.6f}{row[row.index(',') :]}" for k, row in enumerate(rows)]
+    dated = [f"27 Nov 2026 09:00:{k / 100:09.6f}{row[row.index(',') :]}" for k, row in enumerate(rows)]
     path.write_text("\n".join([title, *dated]) + "\n")
-    shown = r"row 1 .* no number: '27.11.2026 09:00:00.000000'; write dates like 2026-01-31T12:00:00.123"
+    shown = r"row 1 .* no number: '27 Nov 2026 09:00:00.000000'; write dates like 2026-01-31T12:00:00.123"
     with pytest.raises(RecordingError, match=shown):
         open_recording(folder)
 

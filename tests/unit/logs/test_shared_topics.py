@@ -185,7 +185,8 @@ def test_a_table_whose_clock_was_set_back_is_named(tmp_path, a_motion, write_asl
 def test_a_clock_that_was_set_forwards_by_years_is_named(tmp_path, a_motion, write_asl, share):
     """By NTP, on a computer without a battery-backed clock: `td-icp` asked for 1 TiB, images were refused."""
     t_ns, gyro, force = a_motion()
-    path = write_asl(tmp_path / "a", imu=(t_ns - 10**18 * (np.arange(len(t_ns)) < share * len(t_ns)), gyro, force))
+    before = np.arange(len(t_ns)) < share * len(t_ns)
+    path = write_asl(tmp_path / "a", imu=(t_ns - 10**18 * before, gyro, force))
     if share < 0.05:  # what there was before is not missed
         assert open_recording(path).imus["imu0"].count == len(t_ns)
         return

@@ -502,9 +502,8 @@ def test_a_disk_that_stalls_is_reported_and_loses_nothing(tmp_path, monkeypatch,
     monkeypatch.setattr("vical_daemon.service.health.STATUS_PERIOD_S", 0.1)
     bus, stop = LocalBus(), threading.Event()
     heard = []
-    bus.subscribe(
-        topics.STATUS.key("rig0", "record"), lambda s: heard.append(m.decode_diagnostics(s.payload).statuses[0])
-    )
+    key = topics.STATUS.key("rig0", "record")
+    bus.subscribe(key, lambda s: heard.append(m.decode_diagnostics(s.payload).statuses[0]))
     log = tmp_path / "log"
     role = threading.Thread(target=record.run, args=(settings(log), bus, stop), kwargs={"clock": CLOCK})
     role.start()

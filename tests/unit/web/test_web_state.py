@@ -531,7 +531,8 @@ def test_downloads_hold_the_present_result_and_the_newest_log(bus, state, web_fe
         (tmp_path / part).write_bytes(b"x")
         os.utime(tmp_path / part, (1e9 - age, 1e9 - age))
     assert downloads.newest_log().name == "new.mcap.part"
-    for age, part in ((9, "rig_19700101T000100Z_ffffff_0001.mcap"), (5, "rig_19700101T000100Z_ffffff_0000.mcap")):
+    for age, segment in ((9, 1), (5, 0)):
+        part = f"rig_19700101T000100Z_ffffff_000{segment}.mcap"
         (tmp_path / part).write_bytes(b"x")
         os.utime(tmp_path / part, (1e9 - age, 1e9 - age))
     assert downloads.newest_log().name == "rig_19700101T000100Z_ffffff_0001.mcap"  # whatever the files' dates

@@ -22,8 +22,10 @@ _TURNS_WITH_GYRO = 0.2
 that are moved by hand; below 0 with gravity removed."""
 _SURELY_TURNS = 0.5  # see `_TURNS_WITH_GYRO`
 _VIOLENT_RPS = 2.0
-"""Median rate of a rig in violent hands. Such a one reads 0.3 to 1.1 g for each rad/s, and 2.5 to 11 m/s^2 with
-gravity removed (`hand_motion` of 200 deg/s, 12 seeds, windows of 5 s)."""
+"""Median rate of a rig in violent hands. Such a one reads 0.3 to 1.1 g for each rad/s, and 2.5 to 11 m/s^2
+with gravity removed (`hand_motion` of 200 deg/s, 12 seeds, windows of 5 s)."""
+_IN_G = 4.0  # the most that it reads in g, likewise
+_EITHER = f"it looks like g (multiply by {STANDARD_GRAVITY_MPS2}), or gravity is removed: move it more slowly"
 _LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
 _STANDS = 0.05  # of the change that the gyro's rates mean
 _NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
@@ -75,6 +77,7 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
     low, median = np.percentile(force, [5, 50]).tolist()
     if _LIKE_GRAVITY[0] < median < _LIKE_GRAVITY[1]:
         return ""
+    violent = gyro > _VIOLENT_RPS and median < min(gyro, _IN_G)  # then motion outweighs gravity
     first = np.hstack([samples.gyro_rps, samples.specific_force_mps2[:, :1]])
     if np.abs(np.linalg.norm(first, axis=1) - 1.0).max() < _UNIT:
         text = "in place of the gyro stands a quaternion: leave the orientations out, or title the columns"
@@ -88,16 +91,16 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
         return ""  # violent motion
     elif constant := constant_channels(samples):
         text = constant
-    elif gyro > _VIOLENT_RPS and 0.6 < median < gyro:  # in both cases the motion outweighs gravity
-        text = f"it looks like g (multiply by {STANDARD_GRAVITY_MPS2}), or gravity is removed: move it more slowly"
     elif median < 0.6 or (low < _MOVES * median and correlation < _TURNS_WITH_GYRO):
         text = "gravity seems to be removed: record the accelerometer as it is"
+        if violent and median > 0.6:
+            text = _EITHER
     elif 0.6 < median < 1.6:
         text = f"it looks like g: multiply by {STANDARD_GRAVITY_MPS2}"
     elif 600 < median < 1600:
         text = f"it looks like mg (multiply by {STANDARD_GRAVITY_MPS2 / 1000}) or cm/s^2 (by 0.01)"
     else:
-        text = "check its unit"
+        text = _EITHER if violent else "check its unit"
     return (
         f"the accelerometer reads {median:.3g} in the middle, m/s^2 (about {STANDARD_GRAVITY_MPS2:.1f}) are "
         f"expected; {text}"

@@ -29,9 +29,7 @@ _BETTER = 0.5  # residual over that of the axes as they are: a wrong sign or swa
 _AXES = "xyz"
 
 
-def mistaken_axes(
-    poses: Sequence[TargetPose], cameras: Mapping[str, CameraState], buffer: ImuBuffer
-) -> str:
+def mistaken_axes(poses: Sequence[TargetPose], cameras: Mapping[str, CameraState], buffer: ImuBuffer) -> str:
     """Name the mistake that explains why no start fits; as `explain_accelerometer`.
 
     Args:

@@ -211,7 +211,6 @@ class Initializer:
         poses, stated = result.poses, 1.0 / size
         found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
-            why = "the first seconds do not fit together yet: fix the board in the room, move the rig"
             why = mistaken_axes(poses, state.cameras, buffer) or why
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:

@@ -61,8 +61,8 @@ def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
     hole_s = float(np.diff(t_s).max())
     if hole_s > LONGEST_HOLE_S:
         return (
-            f"the stamps of the gyro jump by {hole_s / 86_400.0:.0f} days: its clock was set; give the data before "
-            "or after it alone"
+            f"the stamps of the gyro jump by {hole_s / 86_400.0:.0f} days: its clock was set; give the data "
+            "before or after it alone"
         )
     return t_s, gyro
 

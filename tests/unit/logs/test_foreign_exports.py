@@ -1,0 +1,176 @@
+"""Exports of other programs, with their own names of columns: PX4, ArduPilot, Xsens, phones, ROS 2, dates."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from vical_daemon.logs import RecordingError, open_recording
+
+
+def readings(asl_folder):
+    """Rows of stamp (int, ns), rates and forces, as text."""
+    lines = (asl_folder / "mav0/imu0/data.csv").read_text().splitlines()[1:]
+    rows = [line.split(",") for line in lines]
+    return [(int(row[0]), ",".join(row[1:4]), ",".join(row[4:7])) for row in rows]
+
+
+def folder_with(asl_folder, path, name, lines):
+    """The camera of a folder next to another table, of the same clock."""
+    folder = shutil.copytree(asl_folder, path / "asl") / "mav0"
+    shutil.rmtree(folder / "imu0")
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def px4(rows):
+    """`ulog2csv` of sensor_combined, us."""
+    yield (
+        "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],gyro_integral_dt,accelerometer_timestamp_relative,"
+        "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2],accelerometer_integral_dt"
+    )
+    for t_ns, w, f in rows:
+        yield f"{t_ns // 1000},{w},5000,0,{f},5000"
+
+
+def ardupilot(rows):
+    """`mavlogdump.py --format csv --types IMU`, s."""
+    yield "timestamp,TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"
+    for k, (t_ns, w, f) in enumerate(rows):
+        yield f"{t_ns / 1e9:.6f},{k * 5000},0,{w},{f},0,0,35.2,1,1,200,200"
+
+
+def ros2_echo(rows):
+    """`ros2 topic echo --csv` of a sensor_msgs/Imu."""
+    nine = ",".join(["0.0"] * 9)
+    for t_ns, w, f in rows:
+        yield f"{t_ns // 10**9},{t_ns % 10**9},imu_link,0.0,0.0,0.0,1.0,{nine},{w},{nine},{f},{nine}"
+
+
+def xsens(rows, step_ns):
+    """Export of MT Manager (steps of 0.1 ms), or of a DOT (us)."""
+    yield from ("// Start Time: Unknown", "// Update Rate: 100.0Hz", "// Firmware Version: 4.0.2")
+    names = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,FreeAcc_X,FreeAcc_Y,FreeAcc_Z,Gyr_X,Gyr_Y,Gyr_Z"
+    yield names.replace(",", "\t")
+    for k, (t_ns, w, f) in enumerate(rows):
+        yield f"{k:05d},{round(t_ns / step_ns)},{f},0.1,0.1,0.1,{w}".replace(",", "\t")
+
+
+TABLES = {
+    "PX4": ("imu0.csv", px4, 1e-6),
+    "ArduPilot": ("imu0.csv", ardupilot, 1e-6),
+    "ros2 topic echo": ("imu0.csv", ros2_echo, 0.0),
+    "Xsens MT": ("imu0.txt", lambda rows: xsens(rows, 100_000), 1e-4),
+    "Xsens DOT": ("imu0.txt", lambda rows: xsens(rows, 1000), 1e-6),
+}
+
+
+@pytest.mark.parametrize("program", TABLES)
+def test_columns_are_found_by_the_names_that_programs_give_them(asl_folder, tmp_path, program):
+    expected = open_recording(asl_folder, as_recorded=True).imu_arrays("imu0")
+    name, write, step_s = TABLES[program]
+    folder = folder_with(asl_folder, tmp_path, name, write(readings(asl_folder)))
+    found = open_recording(folder, as_recorded=True).imu_arrays("imu0")
+    np.testing.assert_allclose(found.t_ns, expected.t_ns, atol=1e9 * step_s, rtol=0.0)
+    np.testing.assert_array_equal(found.gyro_rps, expected.gyro_rps)
+    np.testing.assert_array_equal(found.specific_force_mps2, expected.specific_force_mps2)
+
+
+def test_an_empty_column_of_stamps_is_named(asl_folder, tmp_path):
+    lines = [line.split("\t") for line in xsens(readings(asl_folder), 1000)]
+    for line in lines[4:]:
+        line[1] = ""
+    empty = ["\t".join(line) for line in lines]
+    with pytest.raises(RecordingError, match="its column of stamps has no numbers"):
+        open_recording(folder_with(asl_folder, tmp_path, "imu0.txt", empty))
+
+
+def sensor_logger(rows):
+    records = [{"sensor": "Metadata", "version": "3"}]
+    for sensor, which in (("Accelerometer", None), ("Gyroscope", 1), ("TotalAcceleration", 2)):
+        for row in rows:
+            x, y, z = row[which].split(",") if which else ("0.1", "0.1", "0.1")
+            times = {"time": str(row[0]), "seconds_elapsed": "0.1"}
+            records.append({"sensor": sensor, **times, "z": z, "y": y, "x": x})
+    yield json.dumps(records)
+
+
+def gnss_logger(rows):
+    yield "# Header Description:\n#\n# Raw,utcTimeMillis,TimeNanos\n#"
+    units = {"Accel": "Mps2", "Gyro": "RadPerSec"}
+    for sensor, unit in units.items():
+        axes = ",".join(f"Uncal{sensor}{axis}{unit}" for axis in "XYZ")
+        biases = ",".join(f"Bias{axis}{unit}" for axis in "XYZ")
+        yield f"# Uncal{sensor},utcTimeMillis,elapsedRealtimeNanos,{axes},{biases}\n#"
+    for t_ns, w, f in rows:
+        yield f"UncalAccel,1690000000000,{t_ns},{f},0,0,0\nRaw,1,2\nUncalGyro,1690000000000,{t_ns},{w},0,0,0"
+
+
+@pytest.mark.parametrize(
+    ("name", "write"), [("Recording.json", sensor_logger), ("gnss_log_2026_01_31.txt", gnss_logger)]
+)
+def test_records_that_name_their_sensor_are_one_imu(asl_folder, tmp_path, name, write):
+    expected = open_recording(asl_folder, as_recorded=True).imu_arrays("imu0")
+    recording = open_recording(
+        folder_with(asl_folder, tmp_path, name, write(readings(asl_folder))), as_recorded=True
+    )
+    found = recording.imu_arrays("imu0")
+    assert found.t_ns.tolist() == expected.t_ns.tolist()
+    np.testing.assert_allclose(found.gyro_rps, expected.gyro_rps, atol=1e-12)
+    np.testing.assert_allclose(found.specific_force_mps2, expected.specific_force_mps2, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["Recording.json", "gnss_log.txt"])
+def test_records_that_are_cut_off(asl_folder, tmp_path, name):
+    write = sensor_logger if name.endswith("json") else gnss_logger
+    text = "\n".join(write(readings(asl_folder)))
+    folder = folder_with(asl_folder, tmp_path, name, [text[:-40]])
+    if name.endswith("json"):
+        with pytest.raises(RecordingError, match=r"Recording.json is no whole export of Sensor Logger"):
+            open_recording(folder)
+    else:
+        assert open_recording(folder, as_recorded=True).imus["imu0"].count > 100
+
+
+def test_a_table_of_realsense_with_three_clocks_is_refused_with_what_to_give(asl_folder, tmp_path):
+    title = "Stream Type,F#,HW Timestamp (ms),Backend Timestamp(ms),Host Timestamp(ms),3DOF_x,3DOF_y,3DOF_z"
+    lines = ["", "", title, *["Gyro,1,5.000,6.000,7.000,0.1,0.1,0.1"] * 30]
+    with pytest.raises(RecordingError, match=r"rs-convert mixes three clocks in it; give the camera's .bag"):
+        open_recording(folder_with(asl_folder, tmp_path, "rec_1200_imu_pose.csv", lines))
+
+
+def dated(asl_folder, path, written, day):
+    """A recording with dates of July 2026 in both tables."""
+    folder = shutil.copytree(asl_folder, path)
+    begin_ns = readings(asl_folder)[0][0]
+    first = datetime(2026, 7, day, 12, tzinfo=UTC)
+    for table in ("imu0/data.csv", "cam0/corners.csv"):
+        title, *rows = (folder / "mav0" / table).read_text().splitlines()
+        lines = [title]
+        for row in rows:
+            stamp, _, rest = row.partition(",")
+            t_ns = int(first.timestamp()) * 10**9 + int(stamp) - begin_ns
+            at = datetime.fromtimestamp(t_ns // 10**9, tz=UTC)
+            lines.append(f"{at.strftime(written)} {at:%H:%M:%S}.{t_ns % 10**9:09d},{rest}")
+        (folder / "mav0" / table).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("written", "day"),
+    [("%d.%m.%Y", 8), ("%d.%m.%Y", 27), ("%d/%m/%Y", 27), ("%m/%d/%Y", 27), ("%Y/%m/%d", 8)],
+)
+def test_dates_of_other_countries(asl_folder, tmp_path, written, day):
+    found = open_recording(dated(asl_folder, tmp_path / "a", written, day))
+    expected = open_recording(dated(asl_folder, tmp_path / "b", "%Y-%m-%d", day))
+    assert found.imu_arrays("imu0").t_ns.tolist() == expected.imu_arrays("imu0").t_ns.tolist()
+
+
+@pytest.mark.parametrize("written", ["%d/%m/%Y", "%m/%d/%Y"])
+def test_dates_that_may_mean_two_days_are_refused(asl_folder, tmp_path, written):
+    with pytest.raises(RecordingError, match="day or month first\\? nothing shows it; write dates like"):
+        open_recording(dated(asl_folder, tmp_path / "a", written, 8))
