@@ -30,6 +30,7 @@ _MAX_FRAMES = 500  # of each camera
 _KEEP_S = 1.25 * LONG_S  # of images, however many they are
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
+_NO_FIT = "the first seconds do not fit together yet: keep the board in view and moving"
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
@@ -211,7 +212,6 @@ class Initializer:
         poses, stated = result.poses, 1.0 / size
         found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
-            why = mistaken_axes(poses, state.cameras, buffer) or why
             return other or _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
