@@ -85,6 +85,9 @@ def describe(error: BaseException) -> tuple[str, int]:
     path = write_crash_log(error)
     where = f"the traceback is in {path}" if path else "no folder to write the traceback to"
     line = _one_line(f"{type(error).__name__}: {error}")
+    if isinstance(error, MemoryError):
+        why = _one_line(str(error)) or "has this process a limit (ulimit -v, a container)?"
+        return f"out of memory: {why}; {where}", EXIT_FAILURE
     return f"internal error: {line}; {where}, please report it", EXIT_FAILURE
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import fcntl
 import io
 import os
 import sys
@@ -22,13 +23,20 @@ def readable(error: UnicodeError) -> tuple[str, int]:
 def open_closed_streams() -> None:
     """Point standard streams that are closed (``vical … >&-``) at nothing.
 
-    The next file that is opened would take their numbers, and libraries in C print into it.
+    The next file that is opened would take their numbers, and libraries in C print into it. If a script in
+    between (of pyenv, or one's own) started this program, that file is the script, which nothing can be
+    written to.
     """
     for number in (0, 1, 2):
         try:
-            os.fstat(number)
+            access = fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+        else:
+            if number > 0 and access == os.O_RDONLY:
+                nothing = os.open(os.devnull, os.O_RDWR)
+                os.dup2(nothing, number)
+                os.close(nothing)
     sys.stdout = sys.stdout or os.fdopen(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", encoding="utf-8", closefd=False)
 

@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     from vical_daemon.logs import open_recording, unfit_imus
     from vical_daemon.offline.replay import replay
 
-    if args.speed < 0 or args.wait < 0:
-        raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
+    if not (args.speed >= 0 and args.wait >= 0):
+        raise CliError("--speed and --wait must be numbers, and not negative", EXIT_USAGE)
     recording = open_recording(args.log, topics=args.streams, check=False, as_recorded=True)
     for text in unfit_imus(recording):
         warn(text)

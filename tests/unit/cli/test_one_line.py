@@ -129,6 +129,7 @@ def test_a_thread_that_dies_is_one_line(
     for error, wanted in (
         (FULL, "No space left on device"),
         (KeyError("x"), "internal error: KeyError: 'x'"),
+        (MemoryError(), "out of memory: has this process a limit"),
     ):
 
         def die(error: Exception = error) -> None:

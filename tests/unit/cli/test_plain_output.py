@@ -34,6 +34,17 @@ def test_closed_streams_are_no_error_and_no_file_takes_their_place(closed):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_script_in_between_does_not_take_the_place_of_a_closed_stream(tmp_path):
+    """A shell reads its script by the lowest free number: errors ended in `Bad file descriptor`."""
+    script = tmp_path / "vical"
+    script.write_text(f'#!/bin/bash\nexec "{sys.executable}" -m vical_daemon "$@"\n')
+    script.chmod(0o755)
+    done = subprocess.run(
+        f'"{script}" info --nonsense 2>&-', shell=True, capture_output=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (2, b"")
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_what_an_encoding_lacks_is_replaced(encoding):
     script = (
