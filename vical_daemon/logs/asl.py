@@ -383,6 +383,12 @@ class AslRecording(Recording):
         keys = {"imu": IMU, "points": POINTS, "tracks": TRACKS, "compressed": COMPRESSED}
         if not len(t_ns):
             raise RecordingError(f"{path}: no data")
+        if np.abs(t_ns).max() >= 2**31 * 10**9:
+            year = 1970.0 + float(t_ns[np.argmax(np.abs(t_ns))]) / 31_556_952e9
+            raise RecordingError(
+                f"{path}: its stamps reach the year {year:.0f}, and those of ROS 2 end in 2038: subtract the "
+                "same from all stamps, of images, too (or are they ns?)"
+            )
         try:
             key = keys[kind].key(RIG, name)
         except TopicError as error:

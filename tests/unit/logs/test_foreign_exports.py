@@ -174,3 +174,12 @@ def test_dates_of_other_countries(asl_folder, tmp_path, written, day):
 def test_dates_that_may_mean_two_days_are_refused(asl_folder, tmp_path, written):
     with pytest.raises(RecordingError, match="day or month first\\? nothing shows it; write dates like"):
         open_recording(dated(asl_folder, tmp_path / "a", written, 8))
+
+
+def test_stamps_after_2038_are_refused_with_what_to_do(asl_folder, tmp_path):
+    """`'i' format requires -2147483648 <= number`, it had said, and first while it calibrated."""
+    rows = (f"{t_ns + 10**18},{w},{f}" for t_ns, w, f in readings(asl_folder))
+    with pytest.raises(
+        RecordingError, match=r"imu0.csv: its stamps reach the year 20\d\d, and those of ROS 2 end"
+    ):
+        open_recording(folder_with(asl_folder, tmp_path, "imu0.csv", rows))
