@@ -91,5 +91,11 @@ def _clock_of(t_ns: int, now: HostClocks, before_ns: int | None) -> tuple[int, s
         (abs(here_ns - moved_ns) + handicap_ns, moved_ns, name)
         for name, moved_ns, handicap_ns in clocks
         if oldest_ns <= moved_ns <= here_ns + PLAUSIBLE_NS
+        and (name != "realtime" or _in_order(moved_ns, here_ns, before_ns))
     ]
     return min(near)[1:] if near else None
+
+
+def _in_order(t_ns: int, here_ns: int, before_ns: int | None) -> bool:
+    """Whether a stamp lies between the one before it and now: if not, the wall clock was set after it."""
+    return (before_ns is None or t_ns > before_ns - _CLEARLY_NS) and t_ns < here_ns + _CLEARLY_NS

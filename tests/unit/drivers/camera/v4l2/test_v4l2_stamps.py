@@ -7,6 +7,9 @@ import pytest
 from vical_drivers.camera.losses import SequenceCounter, StampGaps
 from vical_drivers.camera.stamps import Anchor, Shutter, exposure_middle
 from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.kernel_stamp import kernel_stamp
+from vical_drivers.camera.v4l2.node import DequeuedBuffer
+from vical_drivers.host_clocks import HostClocks
 from vical_mocks.v4l2_camera import CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, FakeCamera
 
 READOUT_S = 0.008
@@ -113,6 +116,18 @@ def test_assumed_exposure_serves_a_camera_without_the_control(open_fake) -> None
     camera = FakeCamera(controls=[])
     frame = open_fake(camera, assume_exposure_s=0.005, readout_s=READOUT_S).read(1.0)
     assert frame.t_exposure_mid_ns == camera.truth[frame.sequence].t_stamp_ns - 8_000_000 - 2_500_000
+
+
+@pytest.mark.parametrize("step_s", [-5.0, 5.0, -3e8, 1.7e9])
+def test_an_image_that_waits_while_the_wall_clock_is_set_is_dated_by_its_arrival(step_s: float) -> None:
+    """By NTP, after a start without a battery-backed clock: 5 s were taken for a stamp in the future."""
+    now_ns, wall_ns = 100 * 10**9, 1_600_000_000 * 10**9
+    buffer = DequeuedBuffer(0, 0, abi.BUF_FLAG_TIMESTAMP_MONOTONIC, wall_ns + now_ns - 30_000_000, 1)
+    for moved_s, anchor in ((0.0, Anchor.END_OF_FRAME), (step_s, Anchor.ARRIVAL)):
+        now = HostClocks(now_ns, wall_ns + now_ns + round(1e9 * moved_s), now_ns)
+        made = kernel_stamp(buffer, driver="x", now=now, before_ns=now_ns - 63_000_000)
+        assert made.anchor is anchor
+        assert now_ns - made.t_raw_ns == (0 if moved_s else 30_000_000)
 
 
 def test_realtime_stamps_are_brought_to_the_monotonic_clock(open_fake) -> None:
