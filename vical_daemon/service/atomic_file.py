@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from contextlib import suppress
@@ -34,11 +35,26 @@ def atomic_write(path: Path, data: bytes, *, durable: bool = True) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from None  # `write` does not name the file
     if not durable:
         return
-    folder = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path | int) -> None:
+    """Make a rename in a folder survive a power cut, where the file system can do that.
+
+    Some network disks, and those of virtual machines, sync files alone.
+
+    Args:
+        folder: Its path, or a descriptor of it.
+    """
+    descriptor = folder if isinstance(folder, int) else os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        os.fsync(folder)
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
     finally:
-        os.close(folder)
+        if descriptor != folder:
+            os.close(descriptor)
 
 
 def write_output(path: Path, data: str | bytes) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import stat
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ from vical_daemon.bus import messages as m
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Sample
 from vical_daemon.config.model import loads
-from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.logs.mcap import LogError, LogFolder, LogReader
 from vical_daemon.record.queue import RecordQueue, arrival
 from vical_daemon.record.recorder import Recorder
 from vical_daemon.service.wall_clock import private_clock
@@ -192,3 +194,32 @@ def test_without_its_list_the_dates_count(tmp_path, damage):
     paths = [record_run(tmp_path, unix_s) for unix_s in (20, 10)]
     (tmp_path / ".recorder.lock").write_bytes(damage)
     assert LogFolder(tmp_path).segments() == paths[::-1]
+
+
+def test_a_disk_without_locks_is_named(tmp_path, monkeypatch):
+    """It was taken for one on which another recorder writes: `standing by`, for ever."""
+
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with pytest.raises(LogError, match=r"recorder.lock: No locks available; mount this disk with locks"):
+        LogFolder(tmp_path).lock()
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
+def test_a_disk_that_cannot_sync_folders_keeps_its_recordings(recorder, tmp_path, monkeypatch, number):
+    """CIFS, and shared folders of virtual machines: `cannot finish ...: Invalid argument`, of a finished file."""
+    sync = os.fsync
+
+    def of_files_alone(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        sync(descriptor)
+
+    feed(recorder, 0, 5)
+    monkeypatch.setattr(os, "fsync", of_files_alone)
+    recorder.close()
+    problem = recorder.status(RecordQueue(), 0).message
+    assert ("cannot finish" in problem) == (number == errno.EIO)
+    assert kept(tmp_path / "log") == [0, 1, 2, 3, 4]

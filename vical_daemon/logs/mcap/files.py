@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from vical_daemon.service.atomic_file import sync_folder
+
 PART_SUFFIX = ".part"
 
 
@@ -83,7 +85,7 @@ class LockedFile:
             raise LogError(f"{self.path.with_name(name)} exists already; remove it or choose another name")
         try:
             os.rename(self.path.name, name, src_dir_fd=self._folder_fd, dst_dir_fd=self._folder_fd)
-            os.fsync(self._folder_fd)
+            sync_folder(self._folder_fd)
         except OSError as error:
             raise LogError(f"cannot finish {self.path}: {describe(error)}") from None
 
@@ -140,15 +142,6 @@ def holds_data(path: Path) -> bool:
     except OSError:  # another user's file: reading it later will report the error
         return True
     return False
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a rename in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def publish(part: Path, path: Path) -> None:

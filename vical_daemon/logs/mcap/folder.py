@@ -52,7 +52,7 @@ class LogFolder:
         """Take the lock of this folder; False if another process holds it.
 
         Raises:
-            LogError: The folder cannot be made or written.
+            LogError: The folder cannot be made, written or locked.
         """
         if self.locked and self.in_place():
             return True
@@ -64,9 +64,15 @@ class LogFolder:
             raise LogError(f"cannot record into {self.path}: {describe(error)}") from None
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             os.close(descriptor)
             return False
+        except OSError as error:
+            os.close(descriptor)
+            raise LogError(
+                f"cannot lock {self.path / _LOCK}: {describe(error)}; mount this disk with locks, or record "
+                "onto another"
+            ) from None
         self._lock_fd = descriptor
         return True
 

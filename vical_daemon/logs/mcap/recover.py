@@ -16,9 +16,9 @@ from vical_daemon.logs.mcap.files import (
     holds_data,
     is_being_written,
     publish,
-    sync_folder,
 )
 from vical_daemon.logs.mcap.reader import LogChannel, LogReader
+from vical_daemon.service.atomic_file import sync_folder
 
 _TEMPORARY = ".recovering"
 
