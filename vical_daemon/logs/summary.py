@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
+from vical_daemon.bus.messages import STRING_TYPE, TF_TYPE
 from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogReader
 from vical_daemon.logs.model import Recording
 from vical_daemon.logs.recorded_logs import LogRecording
 
 _PERIODIC_HZ = 0.5
+_HEADLESS = (TF_TYPE, STRING_TYPE)
+"""Types that do not start with a stamp; near 1970 what they start with looks like one."""
 _SAME_CLOCK_MS = 3_600_000.0
 
 
@@ -78,7 +81,6 @@ class _Tally:
 def _take(tally: _Tally, payload: bytes, log_time_ns: int, *, has_header: bool = True) -> None:
     """Take a message; without a stamp of its own it counts as stamped when it was recorded."""
     stamp_ns = stamp_of(payload) if has_header else None
-    # TFMessage and String do not start with a stamp
     plausible = stamp_ns is not None and abs(stamp_ns - log_time_ns) < 10**18
     tally.stamped &= plausible
     tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(log_time_ns))
@@ -104,7 +106,8 @@ def summarise_logs(path: Path, files: list[Path]) -> Summary:
             tally = tallies.get(channel.topic)
             if tally is None:
                 tally = tallies[channel.topic] = _Tally(channel.type_name)
-            _take(tally, message.payload, message.log_time_ns, has_header=channel.encoding == "cdr")
+            has_header = channel.encoding == "cdr" and channel.type_name not in _HEADLESS
+            _take(tally, message.payload, message.log_time_ns, has_header=has_header)
     metadata = {name: values for reader in readers for name, values in reader.metadata}
     attachments = {item.name: len(item.data) for reader in readers for item in reader.attachments}
     warnings = [warning for reader in readers for warning in reader.warnings]
