@@ -209,7 +209,7 @@ def test_a_disk_without_locks_is_named(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
 def test_a_disk_that_cannot_sync_folders_keeps_its_recordings(recorder, tmp_path, monkeypatch, number):
-    """CIFS, and shared folders of virtual machines: `cannot finish ...: Invalid argument`, of a finished file."""
+    """CIFS, shared folders of virtual machines: `cannot finish ...: Invalid argument`, of a finished file."""
     sync = os.fsync
 
     def of_files_alone(descriptor):
