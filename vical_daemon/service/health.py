@@ -20,6 +20,7 @@ CLOCK_STEP_S = 0.1
 _log = logging.getLogger(__name__)
 
 
+_DAY_S = 86_400.0
 Meanwhile = Callable[[float], list[DiagnosticStatus]]
 
 
@@ -39,8 +40,9 @@ class _ClockSteps:
             text = "the system clock was set back: it agrees with vical's stamps again"
         else:
             side = "ahead of" if step_s > 0 else "behind"
+            size = f"{abs(step_s):.1f} s" if abs(step_s) < _DAY_S else f"{abs(step_s) / _DAY_S:.0f} days"
             text = (
-                f"the system clock was set: it is {abs(step_s):.1f} s {side} vical's stamps, "
+                f"the system clock was set: it is {size} {side} vical's stamps, "
                 "which keep the old time until the next boot"
             )
         _log.warning("%s", text)

@@ -48,7 +48,7 @@ def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.Monkey
     monkeypatch.setattr(health, "_clock_steps", health._ClockSteps())
     clock, bus = private_clock(), LocalBus()
     senders = [health.StatusSender("rig0", role, bus, clock) for role in ("imu", "camera", "record")]
-    for offset_s in (0.0, 0.004, 3600.0, 3600.0, 0.0, 0.0, -1.0):
+    for offset_s in (0.0, 0.004, 3600.0, 3600.0, 0.0, 0.0, -1.0, 1.7e9):
         monkeypatch.setattr(
             wall_clock, "measure_offset_ns", lambda s=offset_s: clock.offset_ns + round(1e9 * s)
         )
@@ -59,6 +59,7 @@ def test_a_system_clock_that_is_set_is_announced_once(monkeypatch: pytest.Monkey
         f"clock_set: the system clock was set: it is 3600.0 s ahead of vical's stamps, {tail}",
         "clock_set: the system clock was set back: it agrees with vical's stamps again",
         f"clock_set: the system clock was set: it is 1.0 s behind vical's stamps, {tail}",
+        f"clock_set: the system clock was set: it is 19676 days ahead of vical's stamps, {tail}",
     ]
 
 
