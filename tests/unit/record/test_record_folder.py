@@ -186,13 +186,13 @@ def test_copied_runs_come_before_listed_ones_and_deleted_ones_are_forgotten(tmp_
     first.unlink()
     third = record_run(tmp_path, 10)
     assert LogFolder(tmp_path).segments() == [copied, second, third]
-    assert len((tmp_path / ".recorder.lock").read_text().splitlines()) == 2
+    assert len((tmp_path / ".recorder.runs").read_text().splitlines()) == 2
 
 
 @pytest.mark.parametrize("damage", [b"", b"\xff\x00nonsense\n"])
 def test_without_its_list_the_dates_count(tmp_path, damage):
     paths = [record_run(tmp_path, unix_s) for unix_s in (20, 10)]
-    (tmp_path / ".recorder.lock").write_bytes(damage)
+    (tmp_path / ".recorder.runs").write_bytes(damage)
     assert LogFolder(tmp_path).segments() == paths[::-1]
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 from vical_daemon.logs.mcap.files import LogError, describe
 from vical_daemon.logs.mcap.recover import Recovery, recover_folder
+from vical_daemon.service.atomic_file import atomic_write
 
-_LOCK = ".recorder.lock"
+_LOCK, _RUNS = ".recorder.lock", ".recorder.runs"
 # Only files of this form are ever deleted: rig_YYYYmmddTHHMMSSZ_run_segment.mcap
 _OURS = re.compile(r"[A-Za-z]\w*_(\d{8}T\d{6}Z)_([0-9a-f]{6})_(\d{4,})(\.recovered)?\.mcap(\.part)?")
 
@@ -100,9 +101,8 @@ class LogFolder:
     def begin_run(self, rig: str, unix_ns: int) -> str:
         """Return the first part of the segment names of a new run, and note that it is the newest.
 
-        The lock file lists the marks of all runs in the order in which they began: a computer without a
-        battery-backed clock may date a run years before the one that it follows. If the list cannot be
-        written (a full disk, another user's file), the dates count at the next start.
+        A file lists the marks of all runs in the order in which they began: a computer without a battery-backed
+        clock may date a run years before the one that it follows.
 
         Args:
             rig: First part of the names.
@@ -112,12 +112,8 @@ class LogFolder:
         here = (_OURS.fullmatch(path.name) for path in self.path.glob("*.mcap*"))
         present = {match[2] for match in here if match}
         self._runs = [*(run for run in self._listed() if run in present), mark]
-        data = "".join(f"{run}\n" for run in self._runs).encode()
-        if self.locked:
-            with suppress(OSError):
-                os.pwrite(self._lock_fd, data, 0)  # after a crash here the old end is still behind it
-                os.ftruncate(self._lock_fd, len(data))
-                os.fdatasync(self._lock_fd)
+        with suppress(OSError):  # of a full disk: the segment will report it
+            atomic_write(self.path / _RUNS, "".join(f"{run}\n" for run in self._runs).encode())
         begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
         return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{mark}"
 
@@ -125,14 +121,14 @@ class LogFolder:
         """Marks of the runs in the order in which they began; [] if that is not known."""
         if not self._runs:
             with suppress(OSError):
-                text = (self.path / _LOCK).read_text(encoding="ascii", errors="replace")
+                text = (self.path / _RUNS).read_text(encoding="ascii", errors="replace")
                 self._runs = re.findall(r"^[0-9a-f]{6}$", text, re.MULTILINE)
         return self._runs
 
     def segments(self) -> list[Path]:
         """Finished segments of vical, oldest first.
 
-        Runs that the lock file lists are in its order. Others (copied, or of an older version) come before
+        Runs that `.recorder.runs` lists are in its order. Others (copied, or of an older version) come before
         them, by the dates in their names. The time of a file would be that of its recovery or copy, and it
         steps with the wall clock.
         """
