@@ -61,6 +61,8 @@ def _with_iso_dates(text: bytes) -> bytes:
         year, day, month = match["last"], match["first"], match["second"]
         if match["year"]:
             year, month, day = match["year"], match["second"], match["last"]
+        elif len(year) != 4:
+            return match[0]
         elif match["mark"] == b"/" and month_first:
             day, month = month, day
         return b"%s%s-%02d-%02dT" % (match["before"], year, int(month), int(day))

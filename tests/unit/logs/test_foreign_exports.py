@@ -170,6 +170,11 @@ def test_dates_of_other_countries(asl_folder, tmp_path, written, day):
     assert found.imu_arrays("imu0").t_ns.tolist() == expected.imu_arrays("imu0").t_ns.tolist()
 
 
+def test_years_of_two_digits_are_shown_as_they_are(asl_folder, tmp_path):
+    with pytest.raises(RecordingError, match=r"its stamp is no number: '27.07.26 12:00"):
+        open_recording(dated(asl_folder, tmp_path / "a", "%d.%m.%y", 27))
+
+
 @pytest.mark.parametrize("written", ["%d/%m/%Y", "%m/%d/%Y"])
 def test_dates_that_may_mean_two_days_are_refused(asl_folder, tmp_path, written):
     with pytest.raises(RecordingError, match="day or month first\\? nothing shows it; write dates like"):

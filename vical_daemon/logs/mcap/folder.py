@@ -101,8 +101,8 @@ class LogFolder:
     def begin_run(self, rig: str, unix_ns: int) -> str:
         """Return the first part of the segment names of a new run, and note that it is the newest.
 
-        A file lists the marks of all runs in the order in which they began: a computer without a battery-backed
-        clock may date a run years before the one that it follows.
+        A file lists the marks of all runs in the order in which they began: a computer without a
+        battery-backed clock may date a run years before the one that it follows.
 
         Args:
             rig: First part of the names.
