@@ -30,7 +30,7 @@ _MAX_FRAMES = 500  # of each camera
 _KEEP_S = 1.25 * LONG_S  # of images, however many they are
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
-_NO_FIT = "the first seconds do not fit together yet: keep the board in view and moving"
+_NO_FIT = "the first seconds do not fit together yet: fix the board in the room, move the rig"
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
