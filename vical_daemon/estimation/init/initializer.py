@@ -212,7 +212,8 @@ class Initializer:
         poses, stated = result.poses, 1.0 / size
         found = window_start(state, poses, images, make, self._step, buffer, rig.target, stated=stated)
         if found is None:
-            return other or _none(result.reason or why, result.still_axes is not None)
+            why = result.reason or mistaken_axes(poses, state.cameras, buffer) or _NO_FIT
+            return other or _none(why, result.still_axes is not None)
         if found.size is not None:
             return Attempt(size=1.0 if found.size == stated else size * found.size)
         found.filter.began_s = found.filter.state.t_s
