@@ -25,10 +25,10 @@ from benchmarks.ablation_patches import (
     then,
 )
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.filter import calibration_filter, image_intake, image_update
+from vical_daemon.estimation.filter import calibration_filter, image_update, sensor_intake
 from vical_daemon.estimation.filter import snapshot as board_snapshot
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.image_intake import ImageIntake
+from vical_daemon.estimation.filter.sensor_intake import ImageIntake
 from vical_daemon.estimation.inertial import clipped_readings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
@@ -277,7 +277,7 @@ BOARD: dict[str, Mechanism] = {
     "images repeated": Mechanism(
         WRONG,
         "a camera that hangs repeats its image",
-        lambda: [(image_intake, "_same", gives(False))],
+        lambda: [(sensor_intake, "_same", gives(False))],
         disturbances=("camera frozen for 3 s",),
     ),
     # ------------------------------------------------------------------ sigmas too small

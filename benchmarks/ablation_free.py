@@ -25,7 +25,7 @@ from vical_daemon.estimation.smoother import (
     bundle,
     clock_changes,
     first_window,
-    handover,
+    marginal_prior,
     normal,
     target_free_status,
 )
@@ -161,7 +161,7 @@ FREE: dict[str, Mechanism] = {
     "free: walk of the delay": Mechanism(
         MOVED,
         "the time shift may wander from window to window",
-        lambda: [(handover, "SHIFT_WALK", 0.0)],
+        lambda: [(marginal_prior, "SHIFT_WALK", 0.0)],
         **_RULE,
     ),
     "free: what has changed": Mechanism(

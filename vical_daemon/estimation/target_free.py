@@ -19,7 +19,13 @@ from vical_daemon.estimation.filter.image_pace import Thinning
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import (
+    LEAST_POINTS,
+    CalibrationOptions,
+    CameraPrior,
+    Frames,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
@@ -31,24 +37,24 @@ from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit,
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow
-from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import (
     BIASES,
     CORE,
     MarginalPrior,
     calibration_difference,
+    next_window,
+    with_process_noise,
 )
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
-from vical_daemon.estimation.smoother.window import Window
+from vical_daemon.estimation.smoother.window import SLACK_S, STEP_S, Ready, Window, cleaned, ready
 from vical_daemon.estimation.status.evaluator import PATIENCE_S
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
 WINDOW_S = 6.0  # likewise, see `WINDOW_FRAMES`
-_KEEP_S = 12.0  # of images that wait for a start or for inertial data
+_KEEP_S = 2.0 * WINDOW_S  # of images that wait for a start or for inertial data
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _STEPS_GROW = 12  # Gauss-Newton steps for a window that grows; twice as many for its last fit
 _ALWAYS = frozenset({IMU, LAG, SIZE_EFFECT, "readout"})  # is estimated besides what is asked for
@@ -93,7 +99,7 @@ class TargetFreeCalibrator:
         self._noise = ImageNoise(options.corner_sigma_px)
         self._misfit = LensMisfit()
         self._intake = SensorIntake()
-        self._pending: list[Stamped] = []
+        self._pending: Frames = []
         self._fitted_s = -np.inf  # stamp of the last image that fitted
         self._confirmed = False  # a second window contradicts what was known
         self._seek_shift = False  # the time shift is to be found again, and its step has been reported
@@ -182,11 +188,11 @@ class TargetFreeCalibrator:
         if self._intake.buffer is None:
             return []
         while True:
-            if self.window is None:
+            window = self.window
+            if window is None:
                 if not self._try_start(flush):
                     break
                 continue
-            window = self.window
             found = self._ready(window)
             if not found.frames:
                 break
@@ -242,16 +248,14 @@ class TargetFreeCalibrator:
             self._close(fit, begun.bundle)
         return True
 
-    def _begin(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None) -> Begun | str:
+    def _begin(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior | None) -> Begun | str:
         """Start a window from a stretch: the first of all, of another recording, or after a pause."""
         if known is None:
             return self._first.begin(buffer, frames, None, self._noise)
-        if self._anew:
-            found = self._first.of_another(buffer, frames, known, self._stepped_s)
-            return found if isinstance(found, str) else self._go_on(buffer, frames, found)
-        return self._go_on(buffer, frames, known)
+        found = self._first.of_another(buffer, frames, known, self._stepped_s) if self._anew else known
+        return found if isinstance(found, str) else self._go_on(buffer, frames, found)
 
-    def _go_on(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | str:
+    def _go_on(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior) -> Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""
         surely = self._seek_shift or self._confirmed
         begun = DOES_NOT_FIT if surely else self._first.begin(buffer, frames, known, self._noise)
@@ -264,7 +268,7 @@ class TargetFreeCalibrator:
         changed = self._after_change(buffer, frames, known)
         return changed or self._new_biases(buffer, frames, known) or begun
 
-    def _all_anew(self, buffer: ImuBuffer, frames: list[Stamped]) -> Begun | str:
+    def _all_anew(self, buffer: ImuBuffer, frames: Frames) -> Begun | str:
         """Start a window from nothing: neither another mounting nor another clock explains the images."""
         held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
         if isinstance(anew, Begun):
@@ -274,7 +278,7 @@ class TargetFreeCalibrator:
             self.initializer.held = held
         return anew
 
-    def _after_change(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | None:
+    def _after_change(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior) -> Begun | None:
         """Start a window that keeps what has not changed; None where that does not fit either.
 
         An adjustment with mounting and clock free shows which of them has changed; a second one finds it.
@@ -308,7 +312,7 @@ class TargetFreeCalibrator:
         self._seek_shift = self._confirmed = False
         return ended
 
-    def _new_biases(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | None:
+    def _new_biases(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior) -> Begun | None:
         """Start a window that keeps all but the biases, as in another recording; None: it does not fit."""
         if self.latest is None or self._seek_shift:
             return None
@@ -325,7 +329,7 @@ class TargetFreeCalibrator:
         return begun
 
     # ------------------------------------------------------------------ windows
-    def _grow(self, window: Window, frames: list[Stamped]) -> None:
+    def _grow(self, window: Window, frames: Frames) -> None:
         """Take images into the window and adjust it; close it when it is long enough."""
         assert self.carry is not None
         added = window.extend(self._buffer, frames)
@@ -369,9 +373,9 @@ class TargetFreeCalibrator:
 
     def _close(self, fit: Fit, bundle: Bundle) -> None:
         """Carry what the window knows into the next."""
-        window, carry = bundle.window, bundle.carry
+        window = bundle.window
         if fit.parallax < LEAST_PARALLAX:
-            self.latest = carry if self._closed else None
+            self.latest = bundle.carry if self._closed else None
             self._lost(Cause.NO_PARALLAX)
             return
         anew = self._first.by_columns(self._buffer, bundle, fit)
@@ -392,7 +396,9 @@ class TargetFreeCalibrator:
             self.window_closed(window, fit)
         if bundle.view is not None:
             self._reports += window_reports(bundle.problem, bundle.view)
-        self.carry = opened(self._walked(self.evaluator.window_done(fit.carry), window.span_s))
+        carry, noise = self.evaluator.window_done(fit.carry), self.options.imu_noise
+        drifting = self.evaluator.models.drifting
+        self.carry = opened(with_process_noise(carry, noise, window.span_s, drifting=drifting))
         self.window = next_window(window, self.carry)
 
     def _learn_lens(self, window: Window, bundle: Bundle, fit: Fit) -> None:
@@ -403,11 +409,6 @@ class TargetFreeCalibrator:
         own, weighted = information - root.T @ root, information @ window.own_lens
         self._misfit.learn(root * fit.noise.lens_px, own, weighted)
         self._noise = self._noise._replace(lens_px=self._misfit.px)
-
-    def _walked(self, carry: MarginalPrior, span_s: float) -> MarginalPrior:
-        """What goes into the next window: biases and delay walk."""
-        drifting, noise = self.evaluator.models.drifting, self.options.imu_noise
-        return with_process_noise(carry, noise, span_s, drifting=drifting)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""

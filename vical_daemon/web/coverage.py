@@ -16,7 +16,7 @@ from vical_daemon.estimation.model.camera_rays import undistort
 ACROSS = 16
 """Cells over the width of the image."""
 ENOUGH = 5
-"""Corners in a cell that count as seen: as many as the estimator asks for at the edges (`image_coverage`)."""
+"""Corners in a cell that count as seen: as many as the estimator asks for at the edges (`ImageCoverage`)."""
 _NEW = 0.1  # weight of a new image in the misfit of a cell: predictions of the first seconds are forgotten
 _MOST_ROWS = 4 * ACROSS  # a message may state any size
 _TILT_RAD = np.deg2rad(30.0)

@@ -19,16 +19,16 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
+from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.rates import Rates
-from vical_daemon.estimation.model.retract import camera_points, pose_points
+from vical_daemon.estimation.model.retract import CameraPoints, camera_points, pose_points
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, CameraState, Layout, State
 from vical_daemon.estimation.model.target_modes import MODES
-from vical_daemon.estimation.model.target_view import view
-from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.noise.shared_errors import ANNOUNCED_S
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
@@ -313,3 +313,69 @@ class LinearityMonitor:
         """Take a measurement: second-order part over noise at these sigmas."""
         self.limits = _GROWN * sigmas if share < _FLAT else np.zeros(0)
         self.left = _TRUST
+
+
+def moved(motion: Motion, rates: Rates, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Attitude R Exp(omega d) and position p + v d + a d^2 / 2, a delay d later, s, shape (S,) or (1,)."""
+    d = delay_s[:, None]
+    R = motion.R @ so3.exp(rates.omega * d + (0.5 * d * d) * rates.alpha)
+    p = motion.p + motion.v * d + (0.5 * d * d) * rates.accel
+    return R, p
+
+
+def view(
+    points: FloatArray,
+    motion: Motion,
+    camera: CameraPoints,
+    rates: Rates,
+    t_cam_minus_state_s: float,
+    model: str,
+    rows: FloatArray | None = None,
+) -> FloatArray:
+    """Project target points for a batch of states: the measurement model.
+
+    uv = project( R_imu_cam^T ( R_world_imu(t + shift)^T (X - p_world_imu(t + shift)) - p_imu_cam ) ), with
+    the motion `moved` from the state's instant by d = t_cam + shift - t_state. [docs/math/filter.md, eq. (7)]
+
+    Args:
+        points: Points in the world, m, shape (n, 3) or (S, n, 3).
+        motion: Sigma points of the motion, batch S.
+        camera: Sigma points of the camera, batch S or 1.
+        rates: Rates at the state's instant.
+        t_cam_minus_state_s: Image stamp (camera clock) minus the state's instant (imu clock), s.
+        model: radtan or equidistant.
+        rows: For a rolling shutter: (v / height - 1/2) of each point, shape (n,); None: global shutter.
+
+    Returns:
+        Pixels, shape (S, n, 2); not-a-number behind the camera.
+    """
+    R, p = moved(motion, rates, t_cam_minus_state_s + camera.timeshift_s)
+    x_imu = np.matmul(points - p[:, None, :], R)
+    if rows is not None:
+        x_imu = x_imu + _rolling(x_imu, motion, R, rates, camera.readout_s, rows)
+    x_cam = np.matmul(x_imu - camera.p_imu_cam[:, None, :], camera.R_imu_cam)
+    return project(x_cam, camera.intrinsics[:, None, :], camera.distortion[:, None, :], model)
+
+
+def _rolling(
+    x_imu: FloatArray,
+    motion: Motion,
+    R: FloatArray,
+    rates: Rates,
+    readout_s: FloatArray,
+    rows: FloatArray,
+) -> FloatArray:
+    """Displacement in the imu frame of points seen `rows * readout` after the middle row, to third order.
+
+    A point X of the world lies at x = R' (X - p), so that x' = -omega x x - u with u = R' v, and likewise for
+    the derivatives of both.
+    """
+    e = (readout_s[:, None] * rows)[..., None]
+    w, alpha = rates.omega, rates.alpha
+    u = np.matmul(motion.v[:, None, :], R)
+    u1 = np.matmul(rates.accel, R)[:, None, :] - so3.cross(w, u)
+    u2 = rates.jolt - so3.cross(alpha, u) - so3.cross(w, u1)
+    x1 = -so3.cross(w, x_imu) - u
+    x2 = -so3.cross(alpha, x_imu) - so3.cross(w, x1) - u1
+    x3 = -so3.cross(rates.jerk, x_imu) - 2.0 * so3.cross(alpha, x1) - so3.cross(w, x2) - u2
+    return np.asarray(e * (x1 + (0.5 * e) * (x2 + (e / 3.0) * x3)))

@@ -6,11 +6,13 @@ from accelerations (`accel_alignment`), as a *partial* start: some of it stays u
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import (
     ROTATION_SIGMA_RAD,
@@ -32,11 +34,17 @@ from vical_daemon.estimation.init.readout_start import (
     readout,
 )
 from vical_daemon.estimation.init.spacing_ratio import spacing_ratio, stretched
-from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, usable_poses
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, poses_of, usable_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
-from vical_daemon.estimation.init.wrong_lens import blamed, other_lens
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, Frames
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    FloatArray,
+    Frames,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.state import CameraState, Layout
+from vical_daemon.estimation.significance import SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
@@ -248,3 +256,45 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> tu
         (2.0 if long else 1.0) * SHIFT_SIGMA_S,
         ROTATION_SIGMA_RAD,
     )
+
+
+def blamed(held: CameraState, other: CameraState) -> str:
+    """Say that a fixed lens is why there is no start; `other`: the camera with a lens that fits."""
+    return (
+        f"the fixed lens (fx {held.intrinsics[0]:.0f} px) is not this camera's: with fx "
+        f"{other.intrinsics[0]:.0f} px and its own distortion images and gyro agree; "
+        "correct it, or let vical estimate it"
+    )
+
+
+def other_lens(frames: Frames, held: CameraState, target: FloatArray) -> CameraState | None:
+    """Return a camera with a lens that fits images surely better than the fixed one; None: there is none.
+
+    Args:
+        frames: (stamp in s, points), in order, as a global shutter sees them.
+        held: The camera with the lens that is fixed.
+        target: Points of the target, m, shape (n, 3).
+    """
+    fit = lens_fit(frames, held, target)
+    if fit is None:
+        return None
+    gain = _squares(fit.views, held, target) - fit.squares
+    if not gain > chi_square_limit(len(fit.theta), SURE_SIGMAS) * fit.corner_sigma_px**2:
+        return None
+    camera = copy(held)
+    fit.take_into(camera)
+    return camera
+
+
+def _squares(views: list[PointsFrame], lens: CameraState, target: FloatArray) -> float:
+    """Sum of the squared distances of points from where a lens projects them with the best poses, px^2.
+
+    A view that shows no pose with this lens does not count: the sum is rather too small.
+    """
+    total = 0.0
+    for view, found in zip(views, poses_of([(0.0, v) for v in views], lens, target), strict=True):
+        if found is not None:
+            x = target[view.ids] @ found.pose.R_cam_target.T + found.pose.p_cam_target
+            uv_px = project_jacobians(x, lens.intrinsics, lens.distortion, lens.distortion_model)[0]
+            total += float(((view.uv_px - uv_px) ** 2).sum())
+    return total

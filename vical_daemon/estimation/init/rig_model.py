@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vical_daemon.estimation.init.half_turn import HalfTurns
+from vical_daemon.estimation.init.numbering import HalfTurns
 from vical_daemon.estimation.init.spacing_ratio import stretched
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens

@@ -17,7 +17,6 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import SURE
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
-from vical_daemon.estimation.noise.stamp_jitter import PERSISTENT
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
@@ -31,6 +30,11 @@ _WANDERS_S = 5e-4  # three times what they show there; an exposure that varies m
 _MOST_ALIKE = 1.5
 """Correlation of delays, as measured. Wrong lenses and clipped readings move images for longer: 2 to 3."""
 WAYS = 3  # late, to the side, down
+ANNOUNCED_S = 3e-4
+"""From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
+PERSISTENT = 0.5
+"""Correlation of what neighbouring images are late by: nearer to that of a model error (1) than to that of a
+jitter (0)."""
 
 
 @dataclass(slots=True)

@@ -22,8 +22,7 @@ from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
-from vical_daemon.estimation.smoother.image_offsets import moves
-from vical_daemon.estimation.smoother.inertial import links_left
+from vical_daemon.estimation.smoother.inertial import links_left, moves
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
 from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window

@@ -9,17 +9,15 @@ from typing import NamedTuple
 
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior, Frames
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.robust import MOST_STEPS
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit
-from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
-from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, initial_prior, of_another_recording
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.wording import cause_text
 
@@ -54,7 +52,7 @@ class FirstWindow:
         self._without_depth = False  # the rays of the last adjustment hardly cross
 
     def begin(
-        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: ImageNoise
+        self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior | None, noise: ImageNoise
     ) -> Begun | str:
         """Start a window from a stretch, with the calibration of before where there is one; or why not."""
         window = self.initializer.window(buffer, frames, known)
@@ -66,7 +64,7 @@ class FirstWindow:
         return begun or DOES_NOT_FIT
 
     def of_another(
-        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior, stepped_s: float
+        self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior, stepped_s: float
     ) -> MarginalPrior | str:
         """What was known, with the biases by the first images of another recording; or why there are none."""
         window = self.initializer.window(buffer, frames, None)

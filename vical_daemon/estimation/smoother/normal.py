@@ -13,11 +13,20 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
-from vical_daemon.estimation.noise.stamp_jitter import evidence, excess
 from vical_daemon.estimation.robust import huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS
-from vical_daemon.estimation.smoother.image_offsets import FLOORS, LATE, SHIFTED, ImageOffsets, moves
-from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
+from vical_daemon.estimation.smoother.inertial import (
+    FLOORS,
+    LATE,
+    SHIFTED,
+    ImageOffsets,
+    Order,
+    add_links,
+    evidence,
+    excess,
+    link_errors,
+    moves,
+)
 from vical_daemon.estimation.smoother.marginal_prior import (
     BIASES,
     SPEED,

@@ -8,14 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
-from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model import imu_scale
 from vical_daemon.estimation.model.imu_scale import matrices as matrices_of
 from vical_daemon.estimation.model.next_term import reported_camera
 from vical_daemon.estimation.model.retract import moved_camera
-from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
+from vical_daemon.estimation.model.snapshot import (
+    camera_snapshot,
+    imu_snapshot,
+    in_gyro_frame,
+    joint_covariance,
+)
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, mixture

@@ -255,20 +255,6 @@ class TargetFreeInitializer:
         return seeds, result.reason if known is None else ""
 
 
-def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
-    """Centre of the prior of a first window: what is known without its data.
-
-    The start has used the same data. On a flat scene it is off by more than its sigmas: lenses of 842 px
-    instead of 567, lever arms of 1 m. So it says where to begin. Only what nothing else says is taken from
-    it: mounting and time shift, and the focal length where none is given.
-    """
-    before = starting_camera(given)
-    lens = before.intrinsics
-    if given.intrinsics is None:
-        lens = np.concatenate([found.intrinsics[:2], lens[2:]])
-    return replace(found, p_imu_cam=before.p_imu_cam, intrinsics=lens, distortion=before.distortion)
-
-
 def _known(known: MarginalPrior) -> _Found:
     return _Found(deepcopy(known.camera), np.concatenate([known.bias[:3], np.zeros(3), known.imu[1:]]), 5e-3)
 

@@ -12,16 +12,16 @@ from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.noise.lens_limit import WINDOWS
-from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S, PERSISTENT
+from vical_daemon.estimation.noise.shared_errors import ANNOUNCED_S, PERSISTENT
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
+from vical_daemon.estimation.smoother.changed_blocks import MountingWatch, square_of_change
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
-from vical_daemon.estimation.smoother.mounting_watch import MountingWatch, square_of_change
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
     Evaluator,

@@ -15,12 +15,13 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, ImuNoise
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import RELINK_S, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.plausible import usable_points
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220  # the longest tracks: three times what a camera of 75 features shows at once
@@ -28,6 +29,8 @@ _MIN_SEEN = 4  # images of a landmark: eight numbers for three unknowns, so that
 NEAREST_M, FARTHEST_M = 0.1, 200.0  # of a landmark at the start: rooms and streets
 
 IntArray = npt.NDArray[np.intp]
+STEP_S = 1.5  # the window is adjusted again after so much new data; images further apart are not tied to it
+SLACK_S = 1e-3  # stamps are not quite even
 
 
 class Seen(NamedTuple):
@@ -96,7 +99,7 @@ class Window:
         jumps: See `MarginalPrior`.
         measured: Rate, rad/s, and specific force, m/s^2, around each image (with biases), and their
             derivatives, shape (2, F, 6).
-        moves: See `image_offsets.moves`; held during an adjustment, as its derivatives do not count.
+        moves: See `inertial.moves`; held during an adjustment, as its derivatives do not count.
     """
 
     camera: CameraState
@@ -328,3 +331,43 @@ def place(
     usual = float(np.median(shown)) if len(shown) else 0.3
     bearing = np.where(fine[:, None], X / np.maximum(distance, 1e-9)[:, None], d[first])
     return anchor, bearing, np.where(fine, 1.0 / np.maximum(distance, 1e-9), usual)
+
+
+class Ready(NamedTuple):
+    """What can be taken into a window.
+
+    Attributes:
+        frames: (stamp in s, tracks), in order.
+        gap_follows: They are the last before a hole.
+        hole_s: Length of a hole that begins at once, s; 0: none.
+    """
+
+    frames: Frames
+    gap_follows: bool = False
+    hole_s: float = 0.0
+
+
+def ready(waiting: Frames, begin_s: float, end_s: float) -> Ready:
+    """Choose the images to go on with: a step's worth at most, up to the first hole.
+
+    Args:
+        waiting: All that came since, in order.
+        begin_s: Stamp of the window's last image, s.
+        end_s: Stamp up to which inertial data reach, s.
+    """
+    before, out = begin_s, list[tuple[float, PointsFrame]]()
+    for t, frame in waiting:
+        if t > end_s or before - begin_s > STEP_S - SLACK_S:
+            break
+        if t - before > STEP_S:
+            return Ready(out, gap_follows=True, hole_s=0.0 if out else t - before)
+        out.append((t, frame))
+        before = t
+    silent = not out and bool(waiting) and end_s - begin_s > 2.0 * STEP_S
+    return Ready(out, hole_s=end_s - begin_s if silent else 0.0)
+
+
+def cleaned(frame: PointsFrame) -> PointsFrame:
+    """Return the tracks at possible pixels, each identity once."""
+    ok = usable_points(frame)
+    return frame.only(ok)

@@ -14,7 +14,7 @@ from vical_daemon.estimation.guidance import Guidance, WeakDirection
 from vical_daemon.estimation.inertial.units import ImuArrays, unit_mistake
 from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.unscented import RIDGE
-from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.noise.shared_errors import ANNOUNCED_S
 from vical_daemon.estimation.result import NEARLY, CalibrationEstimate, CameraEstimate, ImuEstimate, Status
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,

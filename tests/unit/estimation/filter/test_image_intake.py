@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.filter.image_intake import ImageIntake, by_present_stamps
+from vical_daemon.estimation.filter.sensor_intake import ImageIntake, by_present_stamps
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.wording import event_text

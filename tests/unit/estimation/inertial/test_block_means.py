@@ -8,8 +8,7 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import ImuDensities, reference_rig
 
 from tests.unit.estimation.test_calibrator import calibrate, errors
-from vical_daemon.estimation.inertial.block_means import BlockMeans
-from vical_daemon.estimation.inertial.imu_intake import ImuIntake
+from vical_daemon.estimation.inertial.imu_intake import BlockMeans, ImuIntake
 
 SIX = np.arange(6.0)
 

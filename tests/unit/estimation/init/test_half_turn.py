@@ -10,7 +10,7 @@ import pytest
 from vical_mocks.points import SimulatedRun, simulate
 
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.init.half_turn import HalfTurns
+from vical_daemon.estimation.init.numbering import HalfTurns
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.vision.target import AprilGrid, Checkerboard

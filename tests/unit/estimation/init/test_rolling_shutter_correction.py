@@ -10,12 +10,12 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.trajectory import hand_motion
 
 from vical_daemon.estimation.events import ROLLING
+from vical_daemon.estimation.filter.linearise import view
 from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.init.readout_start import at_middle_row
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import CameraPoints
-from vical_daemon.estimation.model.target_view import view
 
 READOUT_S = 0.02
 

@@ -12,7 +12,7 @@ from tests.unit.estimation.smoother.test_changes import followed
 from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.mounting_watch import MountingWatch, square_of_change
+from vical_daemon.estimation.smoother.changed_blocks import MountingWatch, square_of_change
 
 WINDOW_SIGMA_M = 2e-3  # of one window alone
 CAMERA = CameraState(

@@ -21,10 +21,8 @@ from vical_daemon.estimation.model.retract import camera_difference, moved_camer
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle, correlation
-from vical_daemon.estimation.smoother.handover import initial_prior
-from vical_daemon.estimation.smoother.image_offsets import ImageOffsets, moves
-from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.marginal_prior import CORE, first_carry, later
+from vical_daemon.estimation.smoother.inertial import ImageOffsets, Order, moves
+from vical_daemon.estimation.smoother.marginal_prior import CORE, first_carry, initial_prior, later
 from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.track_start import ArmPrior, TrackStart
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit

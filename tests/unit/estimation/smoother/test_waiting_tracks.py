@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.smoother.waiting_tracks import STEP_S, cleaned, ready
+from vical_daemon.estimation.smoother.window import STEP_S, cleaned, ready
 
 
 def images(*stamps_s):

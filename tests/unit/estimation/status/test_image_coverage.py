@@ -9,7 +9,7 @@ from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prio
 from vical_mocks.points import simulate
 
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.status.image_coverage import Cover, ImageCoverage
+from vical_daemon.estimation.status.status_evaluator import Cover, ImageCoverage
 
 
 def spread(low, high, count=4000):

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.tools import allan_variance
+from vical_daemon.estimation.tools import noise_densities
 
 PHASE = {2: 0, 0: 1, -1: 1, -2: 2}  # power-law exponent of the rate noise -> integrations from white noise
 FINE = 8  # white noise values per sample: a sampled rate is the mean of a continuous one
@@ -37,7 +37,7 @@ def brute_edf(alpha: int, factor: int, samples: int) -> float:
 @pytest.mark.parametrize("factor", [1, 3, 10, 30, 45])
 @pytest.mark.parametrize(("alpha", "tolerance"), [(2, 1e-9), (0, 1e-9), (-1, 0.06), (-2, 0.01)])
 def test_degrees_of_freedom_are_those_of_the_covariance(alpha, tolerance, factor):
-    found = allan_variance.degrees_of_freedom(np.array([factor]), np.array([alpha]), 120)[0]
+    found = noise_densities.degrees_of_freedom(np.array([factor]), np.array([alpha]), 120)[0]
     assert found == pytest.approx(brute_edf(alpha, factor, 120), rel=tolerance)
 
 
@@ -65,7 +65,7 @@ GREENHALL = {
 @pytest.mark.parametrize("key", GREENHALL)
 def test_degrees_of_freedom_agree_with_another_implementation(key):
     alpha, factor = key
-    found = allan_variance.degrees_of_freedom(np.array([factor]), np.array([alpha]), 10_000)[0]
+    found = noise_densities.degrees_of_freedom(np.array([factor]), np.array([alpha]), 10_000)[0]
     assert found == pytest.approx(GREENHALL[key], rel=0.02)
 
 
@@ -73,20 +73,20 @@ def test_long_averaging_times_cost_no_more_lags():
     """Above `LAGS` the lags are thinned out: no step there, and an hour at 1 kHz stays quick."""
     factors = np.array([99, 100, 101, 102])
     for alpha in (0, -1, -2):
-        edf = allan_variance.degrees_of_freedom(factors, np.full(4, alpha), 100_000)
+        edf = noise_densities.degrees_of_freedom(factors, np.full(4, alpha), 100_000)
         assert np.all(np.abs(np.diff(edf, 2)) < 5e-4 * edf[0])
-    assert allan_variance.degrees_of_freedom(np.array([700_000]), np.array([-1]), 3_600_000)[0] > 1.0
+    assert noise_densities.degrees_of_freedom(np.array([700_000]), np.array([-1]), 3_600_000)[0] > 1.0
 
 
 def test_one_second_difference_has_one_degree_of_freedom():
-    assert allan_variance.degrees_of_freedom(np.array([5]), np.array([0]), 10)[0] == 1.0
+    assert noise_densities.degrees_of_freedom(np.array([5]), np.array([0]), 10)[0] == 1.0
 
 
 def test_deviation_needs_two_clusters():
     signal = np.random.default_rng(1).standard_normal(20)
-    assert allan_variance.allan_deviation(signal, 1.0, np.array([10])).shape == (1,)
-    with pytest.raises(allan_variance.TooShortError, match="11 s"):
-        allan_variance.allan_deviation(signal, 1.0, np.array([1, 11]))
+    assert noise_densities.allan_deviation(signal, 1.0, np.array([10])).shape == (1,)
+    with pytest.raises(noise_densities.TooShortError, match="11 s"):
+        noise_densities.allan_deviation(signal, 1.0, np.array([1, 11]))
 
 
 def test_no_package_for_it_is_imported():

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vical_daemon.estimation.filter.linearise import view
 from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import CameraPoints
-from vical_daemon.estimation.model.target_view import view
 
 K = np.array([450.0, 455.0, 320.0, 240.0])
 D = np.array([-0.2, 0.05, 1e-3, -5e-4])

@@ -1,11 +1,11 @@
-"""gyro_frame.py: against the polar decomposition of the gyro's matrix."""
+"""The frame of the gyro: against the polar decomposition of the gyro's matrix."""
 
 import numpy as np
 
 from tests.unit.estimation.some_filter import NAME, some_filter
-from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.snapshot import in_gyro_frame
 
 
 def test_the_gyros_frame_is_that_in_which_its_matrix_is_symmetric():
