@@ -11,13 +11,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import (
+    STANDARD_GRAVITY_MPS2,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    PointsFrame,
+)
 from vical_daemon.estimation.result import CameraEstimate
 
 MOST_RPS = math.radians(4000.0)
 """Angular rate about each axis, rad/s: the widest full scale of MEMS gyros for robots (TDK ICM-45686); a
 3DM-GX3-25 has 300 deg/s, as an option 1200."""
-MOST_MPS2 = 50.0 * 9.80665
+MOST_MPS2 = 50.0 * STANDARD_GRAVITY_MPS2
 """Specific force along each axis, m/s^2: the widest full scale of the 3DM-GX3-25 (options of 1.7 to 50 g)."""
 MOST_PX = 16384
 """Width and height of an image, px: the widest sensors of machine vision have 14192 columns (151 MP)."""

@@ -41,11 +41,9 @@ from vical_daemon.estimation.filter.reset import move
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
-from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.inertial_links import ROUNDING
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
@@ -62,6 +60,7 @@ from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
 from vical_daemon.estimation.robust import median
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 
 @dataclass(slots=True)
@@ -167,15 +166,11 @@ class CalibrationFilter:
             moved = move_by_derivatives(self.state, self.layout, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
-        Q = self._noise(moved.influence)
+        Q = moved.influence.noise(self.imu_noise)
         if not straight:
             share = np.sqrt(np.vecdot(moved.curved, moved.curved) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))
         return moved, Q
-
-    def _noise(self, influence: Influence) -> FloatArray:
-        """Covariance of the process noise, shape (9, 9)."""
-        return influence.noise(self.imu_noise) + ROUNDING
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
@@ -297,7 +292,7 @@ class CalibrationFilter:
         lin = self._linearise(image)
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
         if keep.sum() < len(keep) // 2:
-            return 36.0
+            return SURE_SIGMAS**2
         shown = lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves
         normal = normalised(*shown, image.sigma_px[keep])
         return None if normal is None else float(normal @ normal) / len(normal)

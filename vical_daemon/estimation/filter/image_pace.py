@@ -17,12 +17,12 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import measured_gyro_density
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.rates import RATE_BLOCK_S
+from vical_daemon.estimation.significance import EVERY_S
 
 _TIMES = 2.0
 """Change of the rate from one image to the next, over its noise. At 2 the noise adds a quarter to the
 information, so that sigmas are 11 % too small."""
 _LONGEST_S = 0.1  # between images: with fewer than ten a second other weaknesses of slow cameras show
-_LOOK_S = 1.0  # the motion is looked at so often
 _LATEST = 31  # intervals of which the median is taken
 
 
@@ -51,7 +51,7 @@ class ImagePace:
         """
         now_s = -np.inf if buffer is None else buffer.newest_s
         if buffer is not None and rate_change_rps2 is not None and now_s >= self._next_look_s:
-            self._next_look_s = now_s + _LOOK_S
+            self._next_look_s = now_s + EVERY_S
             self._interval_s = interval_s(self._noise, rate_change_rps2, buffer)
         return self._thinning.setdefault(camera, Thinning()).takes(t_cam_s, self._interval_s)
 

@@ -16,7 +16,7 @@ from vical_daemon.estimation.noise.corner_noise import MOST_PX, noise_of_image
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
-_POSE = 6  # degrees of freedom
+POSE_DOF = 6  # degrees of freedom of an image that its pose takes up
 _CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of a corner before the update
 _RESIDUAL_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of what the update leaves of it
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
@@ -74,7 +74,7 @@ def log_likelihood(fit: ImageFit | None, image: Image) -> float:
     """
     noise = 2.0 * float(np.log(image.sigma_px).sum())
     if fit is None:
-        return -0.5 * frame_limit(_POSE) - noise
+        return -0.5 * frame_limit(POSE_DOF) - noise
     kept = int(np.count_nonzero(fit.keep))
     squares = fit.nis + fit.rest / fit.noise**2 + (len(fit.keep) - kept) * _CORNER_GATE
     return -0.5 * (squares + fit.log_det - 2 * kept) - 2 * kept * math.log(fit.noise) - noise

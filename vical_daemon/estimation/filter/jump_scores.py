@@ -18,12 +18,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.unscented import solve_lower, unit
+from vical_daemon.estimation.model.unscented import RIDGE, solve_lower, unit
 
 SIZES = 3.0 ** -np.arange(5)
 """Sizes that a jump may have, over one sigma of the largest, all equally likely a priori: nobody knows how
 far something was moved. The last is 0.6 mm and 0.06 deg of a mounting, less than matters."""
-_LEAST = 1e-12  # variance of a jump over that of one sigma: rounding
 
 
 def _likelihoods(A: FloatArray, b: FloatArray) -> FloatArray:
@@ -222,6 +221,6 @@ class JumpSizes:
     def _information(self) -> tuple[FloatArray, FloatArray]:
         """What the images say about the jump without its prior: A, shape (p, p), and b, shape (p,)."""
         variances, axes = np.linalg.eigh(self.covariance)
-        variances = np.clip(variances, _LEAST, 1.0)
+        variances = np.clip(variances, RIDGE, 1.0)
         A = (axes * (1.0 / variances - 1.0)) @ axes.T
         return A, axes @ (axes.T @ self.mean / variances)

@@ -29,10 +29,10 @@ from vical_daemon.estimation.model.retract import CameraPoints, camera_points, p
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, CameraState, Layout, State
 from vical_daemon.estimation.model.target_modes import MODES
 from vical_daemon.estimation.noise.shared_errors import ANNOUNCED_S
+from vical_daemon.estimation.plausible import MOST_PX
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
-_FAR_PX = 1e5  # pixels of a point that is not in front of the camera
 _STEP = 1e-3  # of a sigma: so small that differences are derivatives
 _ROW_STEPS = 2  # to the row that shows a corner; each leaves a tenth of the error at most
 _TRUST = 100  # images for which a measurement of the second-order part holds
@@ -192,7 +192,7 @@ def by_sigma_points(state: State, layout: Layout, rates: Rates, image: Image, S:
     else:
         pixels = project(None, errors)
     with np.errstate(invalid="ignore"):  # nan is behind the camera
-        valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
+        valid: BoolArray = np.asarray((np.abs(pixels) < MOST_PX).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
     # the columns of S are the ways
@@ -212,7 +212,7 @@ def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: 
     """The same to first order, about the nominal state; global shutter only."""
     uv, ways, by_error = view_derivatives(state, layout, rates, image)
     with np.errstate(invalid="ignore"):  # nan is behind the camera
-        valid: BoolArray = np.asarray((np.abs(uv) < _FAR_PX).all(axis=1))
+        valid: BoolArray = np.asarray((np.abs(uv) < MOST_PX).all(axis=1))
     if not valid.all():
         uv, ways = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], ways, 0.0)
     k = len(by_error)

@@ -119,7 +119,7 @@ class LinearisedFilter(CalibrationFilter):
         for where in self.layout.cameras.values():
             if where.timeshift is not None and where.skew is not None:
                 self.offset[where.timeshift] += moved.seconds * self.offset[where.skew]
-        Q = self._noise(moved.influence)
+        Q = moved.influence.noise(self.imu_noise)
         self._grow(moved._replace(linear=moved.linear @ self.S[:d, :d]), Q)
         self._predict_score(moved, Q)
         state.t_s = end_s

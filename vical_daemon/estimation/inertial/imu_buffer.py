@@ -338,7 +338,7 @@ def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
     dt = t[1:] - t[:-1]
     usual = np.sort(dt)[(len(dt) - 1) // 4]  # of two stamps that nearly coincide, the step says nothing
     chord = (values[1:] - values[:-1]) / dt[:, None]
-    whole = (dt <= 4.0 * usual).astype(np.float64)
+    whole = (dt <= GAP_PERIODS * usual).astype(np.float64)
     sides = np.zeros((len(rows), 1))
     sides[:-1, 0] = whole
     sides[1:, 0] += whole

@@ -14,8 +14,8 @@ from vical_daemon.estimation.inertial.imu_buffer import BLOCK_S, EVEN, GAP_S, Im
 from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
 from vical_daemon.estimation.measurements import IMAGE_GAP_S
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
+from vical_daemon.estimation.significance import STRETCH_S
 
-_CLIPPED_S = 5.0  # from the first clipped reading on, their share in each such stretch is looked at
 _MORE = 2.0  # times the share that was announced last is announced, too
 _APART_S = 10.0  # between two recordings on the common time axis: longer than any gap that is bridged
 
@@ -173,7 +173,7 @@ class ImuIntake:
     def _announce_clipping(self, t_s: float) -> None:
         if self._clipping_s is None and self._at_range:
             self._clipping_s, self._taken = t_s, 1
-        if self._clipping_s is None or t_s <= self._clipping_s + _CLIPPED_S:
+        if self._clipping_s is None or t_s <= self._clipping_s + STRETCH_S:
             return
         share = self._at_range / self._taken
         if share > _MORE * self._share:

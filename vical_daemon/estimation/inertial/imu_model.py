@@ -18,6 +18,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
+_ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
 _SHORT = 64  # rotation steps up to which doubling the number of factors is quickest
 
 
@@ -226,7 +227,7 @@ class Influence(NamedTuple):
         by_clipping = self.by_clipping()
         if by_clipping is not None:
             covariance += by_clipping @ by_clipping.T
-        return covariance
+        return covariance + _ROUNDING
 
     def by_clipping(self) -> FloatArray | None:
         """Return one sigma of the end by what clipped readings of a channel miss, shape (9, 6), or None."""

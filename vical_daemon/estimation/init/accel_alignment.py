@@ -19,20 +19,24 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
+from vical_daemon.estimation.model.priors import (
+    ACCEL_BIAS_SIGMA_MPS2,
+    GYRO_BIAS_SIGMA_RPS,
+    ROTATION_SIGMA_RAD,
+    SHIFT_SIGMA_S,
+    WINDOW_START,
+)
 from vical_daemon.estimation.temporal.rotation_curves import running_integral
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
 _STEP_S = _HALF_S / 20.0  # between windows
 PRIORS = 9
 """Rows of what is known before: lever arm, accelerometer bias and gyro bias."""
-_MIN_WINDOWS = 12  # 36 equations for a rotation and three vectors
 _COARSE_S = 2.0 * _STEP_S  # grid of time shifts: what windows average changes slowly; a fifth about the best
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0  # cost there over the least cost: twice the misfit
-ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
-"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
 _DESCENTS = 12  # damped Gauss-Newton steps from each of the 24 aligned mountings
 _ALIGNED = so3.signed_permutations()
 _STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]
@@ -96,7 +100,7 @@ def gather(path: CameraPath) -> Evidence | None:
         for centre in np.arange(t[0] + half_s, t[-1] - half_s, half_s)
         if (window := _window(float(centre), half_s, t, grid)) is not None
     ]
-    if len(windows) < _MIN_WINDOWS:
+    if len(windows) < MIN_ORIENTATIONS:  # 36 equations for a rotation and three vectors
         return None
     kernels = np.array([kernel for _, kernel in windows])
     weights = np.array([weight for weight, _ in windows])

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.image_update import POSE_DOF
 from vical_daemon.estimation.filter.linearise import Image, by_small_steps, is_rolling, view_derivatives
 from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
@@ -35,6 +36,7 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.model.imu_scale import APART, numbers_of
 from vical_daemon.estimation.model.inertial_links import DONE, RELINK_S, PreintegratedLinks, make_links
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS, SHIFT_SIGMA_S
 from vical_daemon.estimation.model.rates import Rates, rates_at
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import BIASES, GRAVITY, MOTION, State
@@ -45,8 +47,9 @@ from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
-_OF_POSE = 6  # degrees of freedom of an image that its pose takes up
-_EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
+_EDGE_S = (
+    AGAIN_SIGMAS * 2.0 * SHIFT_SIGMA_S
+)  # by which the time shift may still move: five sigmas of the least a start is made with
 
 
 @dataclass(slots=True)
@@ -432,13 +435,13 @@ class BoardWindow:
                 self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
         self.noise = []
         for view, size in zip(views, lengths, strict=True):
-            dof, ratio = max(2 * len(size) - _OF_POSE, 0), _level(size) / self.sigma_px[view.camera]
+            dof, ratio = max(2 * len(size) - POSE_DOF, 0), _level(size) / self.sigma_px[view.camera]
             self.noise.append(noise_of_image(dof * ratio * ratio, dof))
 
 
 def _level(size: FloatArray, images: int = 1) -> float:
     """Corner noise per axis by the median length of residuals, as far as poses have not taken them up."""
-    share = max(1.0 - _OF_POSE * images / (2.0 * len(size)), 0.05)
+    share = max(1.0 - POSE_DOF * images / (2.0 * len(size)), 0.05)
     return median(size) / MEDIAN_RAYLEIGH / math.sqrt(share)
 
 

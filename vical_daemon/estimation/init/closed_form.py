@@ -15,8 +15,6 @@ import numpy as np
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import (
-    ROTATION_SIGMA_RAD,
-    SHIFT_SIGMA_S,
     Alignment,
     CameraPath,
     align,
@@ -43,18 +41,16 @@ from vical_daemon.estimation.measurements import (
     Frames,
     PointsFrame,
 )
+from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.significance import SURE_SIGMAS, chi_square_limit
-from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp import DOUBTFUL_RAD, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about
-_POOR_RAD = np.radians(0.5)
-"""Sigma of a target's orientation above which that is said where a start fails. Targets that fill the image
-have 0.04 to 0.3 deg (12 random rigs); four times as far away, those that fail 0.6 to 2 deg (four of 8)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +140,7 @@ def _too_few_poses(poses: int, images: int) -> str:
 def _poorly_seen(poses: list[TargetPose], lens: CameraState) -> str:
     """What makes a start by rotations hard besides the motion: a target far away, or blurred; or empty."""
     known_rad = float(np.median(attitude_sigmas(poses, lens)))
-    if known_rad < _POOR_RAD:
+    if known_rad < DOUBTFUL_RAD:
         return ""
     return (
         f". Orientations of the target are known to {np.rad2deg(known_rad):.1f} deg: come closer, "

@@ -48,6 +48,7 @@ from vical_daemon.estimation.model.state import (
     State,
 )
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
@@ -57,13 +58,13 @@ _WIDE = 0.03
 """Sigma up to which images are near to linear: of attitude, rad; of position, over the target's distance."""
 _WAIT_S = 2.0
 """For an image that shows the pose so well, or for a camera whose clock was set: a board comes back into view
-within seconds, or not."""
+within seconds, or not. Of another recording, so much shows a time shift: two swings of a hand."""
 _WIDE_MPS = 0.3  # of velocity: ten times what a board in full view gives
-_RECORDING_IMAGES = 8  # of another recording, with poses: fewer do not show which of them are wrong
 _RECORDING_S = 1.5
 """Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
-_SHIFT_S = 2.0  # of images from which on a time shift is looked for: two swings of a hand
-_MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now
+_MOST_S = (
+    2.0 * _WAIT_S
+)  # of images without enough poses among them; what is older says nothing of the motion now
 _POSITION_SIGMA_M = 2e-3  # of a pose of the target, m: weighs the prior of the bias
 
 
@@ -314,7 +315,7 @@ class RecordingStart(MotionRestart):
     def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
         """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
         state = f.state
-        poses = self._enough_poses(state, _RECORDING_IMAGES, _RECORDING_S)
+        poses = self._enough_poses(state, MIN_PAIRS, _RECORDING_S)
         if poses is None:
             return None
         gyro_bias = _gyro_bias(buffer, poses.t_s, poses.R)
@@ -353,7 +354,7 @@ class RecordingStart(MotionRestart):
         poses = [s for s in self._seen if s is not None and s.frame.camera == camera]
         span_s = poses[-1].t_cam_s - poses[0].t_cam_s if poses else 0.0
         attempts = self._attempts.setdefault(camera, Attempts(first_s=0.5))
-        if len(poses) < MIN_ORIENTATIONS or span_s < _SHIFT_S or not attempts.due(poses[-1].t_cam_s):
+        if len(poses) < MIN_ORIENTATIONS or span_s < _WAIT_S or not attempts.due(poses[-1].t_cam_s):
             return None, True
         attempts.tried(poses[-1].t_cam_s)
         rows = buffer.rows
@@ -364,7 +365,7 @@ class RecordingStart(MotionRestart):
             return None, True
         if found.status == "ok":
             return ShiftFit(found.timeshift_cam_imu_s, found.timeshift_sigma_s, stepped=True), True
-        return None, span_s < self._longest_s - _SHIFT_S
+        return None, span_s < self._longest_s - _WAIT_S
 
 
 def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> FloatArray | None:

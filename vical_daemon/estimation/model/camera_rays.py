@@ -14,7 +14,7 @@ from vical_daemon.estimation.geometry.camera_model import (
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.robust import MOST_STEPS
 
-_PATCHES = (8, 6)  # across and down: a lens is close to its linearisation within each
+PATCHES = (8, 6)  # across and down: a lens is close to its linearisation within each
 _NEWTON_DONE = 1e-9
 """Step in normalised units (focal lengths), a millionth of a pixel. What is left after it is its square."""
 
@@ -75,14 +75,14 @@ def rays_over_image(
 
 def patch_centres(resolution: tuple[int, int]) -> FloatArray:
     """Pixels of the centres of eight by six patches of an image, row by row, shape (48, 2)."""
-    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(_PATCHES, resolution, strict=True))
+    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(PATCHES, resolution, strict=True))
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def patches_seen(uv_px: FloatArray, resolution: tuple[int, int]) -> BoolArray:
     """Which of these patches have pixels in them; uv_px shape (n, 2); shape (48,)."""
-    columns, rows = _PATCHES
-    at = (uv_px * (np.array(_PATCHES) / resolution)).astype(np.intp).clip(0, np.array(_PATCHES) - 1)
+    columns, rows = PATCHES
+    at = (uv_px * (np.array(PATCHES) / resolution)).astype(np.intp).clip(0, np.array(PATCHES) - 1)
     return np.bincount(at[:, 1] * columns + at[:, 0], minlength=columns * rows) > 0
 
 

@@ -17,7 +17,7 @@ from vical_daemon.estimation.measurements import CameraPrior, FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
 from vical_daemon.estimation.model.priors import OFF
 
-_OFF_SHARE = 0.02  # of the focal length, of fx fy cx cy; EuRoC's published lens is 1.5 % off in cx
+OFF_SHARE = 0.02  # of the focal length, of fx fy cx cy; EuRoC's published lens is 1.5 % off in cx
 _OFF_DISTORTION = 0.05  # EuRoC's k1: 0.045
 _ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
 _WIDER = 3.0  # times the sigma that is stated: which may be too small
@@ -49,7 +49,7 @@ class FixedLens:
         sigma = np.concatenate(
             [prior.intrinsics_sigma or np.zeros(4), prior.distortion_sigma or np.zeros(n - 4)]
         )
-        default = np.array([_OFF_SHARE * values[0]] * 4 + [_OFF_DISTORTION] * (n - 4))
+        default = np.array([OFF_SHARE * values[0]] * 4 + [_OFF_DISTORTION] * (n - 4))
         return cls(values, sigma, np.maximum(default, _WIDER * sigma))
 
     @classmethod

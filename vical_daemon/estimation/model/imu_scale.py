@@ -16,7 +16,7 @@ from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER, LOWER_FLAT, State
 
-ENTRIES = 15  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
+ENTRIES = 9 + len(LOWER)  # of the matrices of gyro (9) and accelerometer (6, lower triangle)
 APART = slice(ENTRIES, -1)  # m, positions of the accelerometer's axes; none without a start
 NUMBERS = ENTRIES + 6 + 1  # matrices, positions, lag
 # Positions of three axes whose mean is zero, by two vectors; orthonormal, so that no axis is special.

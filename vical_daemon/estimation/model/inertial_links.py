@@ -19,7 +19,6 @@ from vical_daemon.estimation.model.imu_scale import APART, by_apart, by_entries,
 _MAX_HOLE_S = 0.1  # between readings; a window bridges twice what the filter does: it would have to restart
 RELINK_S = 3e-4  # of change of the time shift: links are integrated again between the new instants
 DONE = 1.0  # the last step of an adjustment is one with a smaller predicted reduction of the sum of squares
-ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
@@ -63,7 +62,7 @@ def make_links(
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
     covariance = np.array([e.noise(noise) for e in motion.influences])[:, _ORDER[:, None], _ORDER]
     try:
-        root = np.linalg.inv(np.linalg.cholesky(covariance + ROUNDING))
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
         return None
     by_imu = [e.by_bias() for e in motion.influences]

@@ -15,7 +15,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import patch_centres, unproject
 from vical_daemon.estimation.model.state import CameraState
 
-_UNSEEN_PX = 100.0  # patches of the image in which no points were seen count as known to so many pixels
+UNSEEN_PX = 100.0  # patches of the image in which no points were seen count as known to so many pixels
 Numbers = tuple[float, ...]
 
 
@@ -34,7 +34,7 @@ def onto_model(camera: CameraState, seen: FloatArray) -> FloatArray:
     if not camera.term:
         return np.eye(n)
     by = lens_slopes(*rounded(camera)).reshape(-1, n)
-    N = seen + _UNSEEN_PX**-2.0 * by.T @ by
+    N = seen + UNSEEN_PX**-2.0 * by.T @ by
     # least squares: of a lens that is far off, no patch may have rays, and N may be zero
     moved = np.linalg.lstsq(N[:-1, :-1], N[:-1, -1:], rcond=None)[0]
     return np.concatenate([np.eye(n - 1), moved], axis=1)

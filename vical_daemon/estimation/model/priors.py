@@ -6,6 +6,7 @@ Prior sigmas are many times what a start is worth, so that its data do not count
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 GYRO_BIAS_SIGMA_RPS = 0.02
@@ -70,6 +71,8 @@ class StartSigmas(NamedTuple):
     readout_s: float
 
 
+ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = math.radians(1.0), 1e-3
+"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
 AGAIN_SIGMAS = 5.0
 """Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
 FILTER_START = StartSigmas(0.1, 0.5, 0.3, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.1, 0.01)

@@ -20,15 +20,15 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
 
-MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
 ATTITUDE = slice(0, 3)  # rad, local (right) error of R_world_imu
 POSITION = slice(3, 6)  # m, p_world_imu
 VELOCITY = slice(6, 9)  # m/s, in world
 GYRO_BIAS = slice(9, 12)  # rad/s
 ACCEL_BIAS = slice(12, 15)  # m/s^2
-BIASES = slice(9, 15)  # rad/s, then m/s^2
+BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)  # rad/s, then m/s^2
 GRAVITY = slice(15, 18)  # m/s^2, in the world; see `moved_gravity`
-CORE = 18  # numbers of these
+MOTION = slice(ATTITUDE.start, VELOCITY.stop)  # what moves
+CORE = GRAVITY.stop  # numbers of these
 
 LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
 LOWER_FLAT = 3 * LOWER[:, 0] + LOWER[:, 1]  # the same among its nine numbers, row by row

@@ -244,7 +244,7 @@ class Consistency:
     def _move_scale(self, ratio: float) -> None:
         """Follow the ratio; a level that is 1 within its own scatter stays exactly 1, at no cost."""
         gain = max(_GAIN_END, _GAIN_START / (1.0 + 0.02 * self.images))
-        moved = self._level * (1.0 + gain * (min(ratio, 5.0) * self.scale / self._level - 1.0))
+        moved = self._level * (1.0 + gain * (min(ratio, _MOST) * self.scale / self._level - 1.0))
         self._level = min(max(moved, 0.5), _MAX_SCALE)
         self.scale = self._level if self._level > _DEAD_BAND else 1.0
 

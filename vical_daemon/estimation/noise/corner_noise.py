@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS
 
 _GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
 LEAST_PX, MOST_PX = 0.005, 20.0  # of a corner's noise: a simulation without any, a detector that guesses
@@ -67,7 +68,7 @@ class CornerNoise:
         """Take in the unexplained sum of squares of one frame (whitened by the present sigma)."""
         if dof < 4:
             return
-        ratio = min(whitened_rest / dof, 9.0)
+        ratio = min(whitened_rest / dof, PERHAPS_SIGMAS**2)
         self._sum += ratio * dof * self.sigma_px**2
         self._dof += dof
         if self._dof > self.memory:

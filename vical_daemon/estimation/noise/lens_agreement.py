@@ -19,13 +19,13 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.next_term import onto_model
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
+from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, PERHAPS_SIGMAS, STRETCH_S, chance
 
 _WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5  # of a coefficient: likewise
 # the two highest powers of the radius among fx fy cx cy and the distortion
 _RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
-_MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3  # stretches: with two, one difference would stand for all scatter
 _LONGEST_RUN = 4  # stretches left out together: errors that last longer are taken as constant
 
@@ -187,7 +187,7 @@ class BlockJackknife:
         if self._now is not None:
             self._done.append(self._now)
             self._now = None
-        if len(self._done) > _MOST:
+        if len(self._done) > WINDOWS:  # the oldest two become one
             self._done[:2] = [self._done[0].plus(self._done[1])]
 
     def compared(self, sigmas: FloatArray, onto: FloatArray) -> JackknifeResult:

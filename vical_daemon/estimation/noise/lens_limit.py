@@ -8,10 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.model.next_term import Numbers, lens_slopes, rounded
+from vical_daemon.estimation.model.next_term import UNSEEN_PX, Numbers, lens_slopes, rounded
 from vical_daemon.estimation.model.state import CameraState
-
-_UNSEEN = 1e-2  # of the weight of a patch: its error is a hundred times as large
 
 SYSTEMATIC_PX = 0.003
 """Constant error that corners of one patch of the image share, px; the curvature of edges alone makes up to
@@ -38,7 +36,7 @@ def patches(camera: CameraState, seen: BoolArray | None = None) -> FloatArray:
     """
     by = lens_slopes(*rounded(camera))
     if seen is not None:
-        by = np.where(seen[:, None, None], by, _UNSEEN * by)
+        by = np.where(seen[:, None, None], by, 1.0 / UNSEEN_PX * by)
     return np.asarray(np.linalg.qr(by.reshape(-1, by.shape[-1]))[1])
 
 

@@ -31,7 +31,7 @@ from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
 
 TILT, SPEED, BIASES = slice(0, 2), slice(2, 5), slice(5, 11)  # rad, m/s, rad/s and m/s^2
-CORE = 11
+CORE = BIASES.stop
 """Of the `Layout` of a window's errors. The time shift is that at the first image."""
 
 

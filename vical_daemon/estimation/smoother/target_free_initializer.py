@@ -11,7 +11,6 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.white_noise import at_least_measured
-from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD
 from vical_daemon.estimation.init.attempts import LONG_S, MOVED_PX, Attempts, rest_in_words
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
@@ -23,7 +22,7 @@ from vical_daemon.estimation.measurements import (
     Frames,
 )
 from vical_daemon.estimation.model import imu_scale
-from vical_daemon.estimation.model.priors import WINDOW_START
+from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.track_start import (
@@ -54,7 +53,7 @@ _REACH_S = 2.0  # time shifts that are looked for, to both sides of what is give
 _NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where strung-together turns show none
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # of images in an attempt at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = 2.0 * ROTATION_SIGMA_RAD  # of the mounting by rotations: a window converges from there
-_SHIFT_SIGMA_S = 4e-3  # of the time shift: likewise, 0.2 deg at 60 deg/s
+_SHIFT_SIGMA_S = 4.0 * SHIFT_SIGMA_S  # of the time shift: likewise, 0.2 deg at 60 deg/s
 _LEAST_IMAGES, _MOST_IMAGES = 20, 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 

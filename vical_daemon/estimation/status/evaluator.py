@@ -38,7 +38,7 @@ LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
 _KEPT_NS = 20_000_000  # a reading in so many ns is kept, by which units are checked: hands move up to 5 Hz
 _KEPT = 1000  # of these, 20 s
-_LEAST_NS = 10_000_000_000  # of readings, by which their unit is judged
+_LEAST_NS = _KEPT * _KEPT_NS // 2  # of readings, by which their unit is judged
 
 
 class Verdict(NamedTuple):

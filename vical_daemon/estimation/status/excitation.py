@@ -22,7 +22,7 @@ from vical_daemon.estimation.wording import ALONG
 
 WIDE = ConvergenceTargets(0.005, math.radians(0.5), 0.5e-3)
 """Beyond, a direction counts as not observed at all."""
-_SLOW_RPS = math.radians(12.0)  # rms; below, guidance asks for faster turns
+_SLOW_RPS = 4.0 * MIN_RATE_RPS  # rms; below, guidance asks for faster turns
 _ONE_AXIS = 0.03
 """Second over first eigenvalue of the rates' scatter, below which the rig turned about one axis."""
 _STEADY = 0.3  # change of the rate in a second over the rate, below which it turns steadily

@@ -14,6 +14,7 @@ from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimat
 from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT
 from vical_daemon.estimation.guidance import Edge, Guidance, Lack, Verb, WeakDirection, of_camera
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.camera_rays import PATCHES
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import OFF, SURE
 from vical_daemon.estimation.model.snapshot import in_gyro_frame
@@ -45,7 +46,7 @@ _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
 _KEPT_CHECKS = round(3600.0 / HELD_BACK_EVERY_S)  # of an hour
-_ACROSS, _DOWN = 16, 12  # parts of the picture
+_ACROSS, _DOWN = (2 * n for n in PATCHES)  # parts of the picture
 _LEAST = 5  # corners of a part that has been seen
 _SHARE = 0.5  # of the parts along an edge
 _PARTLY = 0.75  # of the most corners in one image; fewer: targets are seen that are partly in the picture

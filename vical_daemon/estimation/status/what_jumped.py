@@ -24,7 +24,13 @@ from vical_daemon.estimation.filter.jump_scores import JumpScores, JumpSizes
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, SKEW_SIGMA
+from vical_daemon.estimation.model.held_lens import OFF_SHARE
+from vical_daemon.estimation.model.priors import (
+    ACCEL_BIAS_SIGMA_MPS2,
+    FILTER_START,
+    GYRO_BIAS_SIGMA_RPS,
+    SKEW_SIGMA,
+)
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -37,15 +43,12 @@ from vical_daemon.estimation.model.state import (
 )
 from vical_daemon.estimation.status.recent_past import Taken
 
-_SHIFT_S = 5e-3
-"""One sigma of the largest step of the time shift, s (smaller ones: `jump_scores.SIZES`); orientations of
-single images show those of 3 ms and more."""
 _TURN_RAD, _MOVE_M = np.radians(5.0), 0.05
-"""Likewise of a mounting, or of the target, rad and m. Turns four times as large and
-moves twice as large are followed, too."""
-_ZOOM, _SHIFTED = 0.02, 0.01
-"""Likewise of fx and fy, and of cx and cy, over the focal length f: a lens of 5 mm that is focused
-from far to 0.5 m is moved by f^2 / 0.5 m, 1 % of f."""
+"""One sigma of the largest jump of a mounting, or of the target, rad and m (smaller ones:
+`jump_scores.SIZES`). Turns four times as large and moves twice as large are followed, too."""
+_SHIFTED = 0.01
+"""Likewise of cx and cy, over the focal length f: a lens of 5 mm that is focused from far to 0.5 m is moved
+by f^2 / 0.5 m, 1 % of f."""
 
 _ODDS = 20.0
 """Logarithm of the odds from which on an explanation is ruled out: no jump at all, or the jump of a part. In
@@ -93,7 +96,7 @@ def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
     if where.skew is not None:
         out[Part.DRIFT] = _columns(layout.size, [where.skew], [SKEW_SIGMA])
     if where.timeshift is not None:
-        out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [_SHIFT_S])
+        out[Part.SHIFT] = _columns(layout.size, [where.timeshift], [FILTER_START.timeshift_s])
     mountings = {
         name: [*every[c.rotation], *every[c.position]]
         for name, c in layout.cameras.items()
@@ -104,7 +107,7 @@ def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
         out[Part.MOUNTING] = _columns(layout.size, mountings[camera], sigmas)
     if where.intrinsics is not None:  # of a fixed lens, too: its errors are considered
         focal = float(state.cameras[camera].intrinsics[0])
-        sizes = focal * np.repeat([_ZOOM, _SHIFTED], 2)
+        sizes = focal * np.repeat([OFF_SHARE, _SHIFTED], 2)
         out[Part.LENS] = _columns(layout.size, every[where.intrinsics], sizes)
     if len(mountings) > 1:
         errors = [k for own in mountings.values() for k in own]

@@ -30,7 +30,7 @@ from vical_daemon.estimation.temporal.epipolar_errors import (
     sighting_errors,
     track_noise,
 )
-from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
+from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S, Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18  # steps, at most: five with a wide gate, five with the lens as given, then to convergence
@@ -46,7 +46,7 @@ _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves mo
 _GOOD = 0.25  # weight of a feature that fits
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
 _FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
-_BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
+_BLOCK_S = LAGS_S[-1]  # errors of the fit are taken as independent beyond this
 
 
 @dataclass(slots=True)

@@ -19,7 +19,7 @@ from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
-_GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s; a quarter of it about the best ones
+GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s; a quarter of it about the best ones
 _CANDIDATES = 4  # shifts whose directions are compared too: periodic motion agrees in size at several
 
 
@@ -122,9 +122,9 @@ def coarse_start(
     if len(turns.first) < MIN_PAIRS:
         return None
     scale = agreement_scale(turns)
-    grid = np.arange(np.floor(shifts_s[0] / _GRID_S), np.ceil(shifts_s[1] / _GRID_S) + 1.0) * _GRID_S
+    grid = np.arange(np.floor(shifts_s[0] / GRID_S), np.ceil(shifts_s[1] / GRID_S) + 1.0) * GRID_S
     if len(grid) < 2:
-        grid = np.array([grid[0], grid[0] + _GRID_S])
+        grid = np.array([grid[0], grid[0] + GRID_S])
     costs = shift_costs(curve, t_cam_s, turns, grid, scale)
     best: Start | None = None
     for i in _minima(costs, apart=5):
@@ -138,7 +138,7 @@ def _start_at(
     curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float
 ) -> Start | None:
     """Refine the shift around a grid point and solve for the mounting there."""
-    fine = shift_s + np.arange(-6, 7) * (_GRID_S / 4.0)
+    fine = shift_s + np.arange(-6, 7) * (GRID_S / 4.0)
     low, high = curve.span_s
     ta, tb = t_cam_s[turns.first] + fine[:, None], t_cam_s[turns.second] + fine[:, None]
     inside = (ta >= low) & (tb <= high)

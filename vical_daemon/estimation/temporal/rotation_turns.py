@@ -16,6 +16,7 @@ from scipy.special import chdtri
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.robust import MEDIAN_CHI2_3
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS
 
 IntArray = npt.NDArray[np.intp]
 
@@ -25,7 +26,6 @@ MIN_PAIRS = 8  # 24 equations for mounting, bias and delay; as many orientations
 # touched by outliers, by the gyro's bias and by holes; each doubling doubles the turn over the same noise.
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)
 _DISTINCT = 10.0  # ratio of a usual turn to its noise
-_ABOVE_NOISE = 3.0  # a turn this many times its noise is motion
 _LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
 _MAX_PAIRS = 300  # for the start, which needs no more; the polish takes all orientations
 _LOW = 0.05  # quantile of third differences that shows their noise: outliers are above
@@ -153,7 +153,7 @@ def _turn_noise(noise_rad: float) -> float:
 
 def _moving(t_cam_s: FloatArray, turns: Turns, noise_rad: float) -> BoolArray:
     dt = t_cam_s[turns.second] - t_cam_s[turns.first]
-    least = np.maximum(MIN_RATE_RPS * dt, _ABOVE_NOISE * _turn_noise(noise_rad))
+    least = np.maximum(MIN_RATE_RPS * dt, PERHAPS_SIGMAS * _turn_noise(noise_rad))
     return np.asarray(turns.angle > least)
 
 

@@ -14,9 +14,10 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+from vical_daemon.estimation.temporal.rotation_start import GRID_S
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS
 
-_GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
+_GRID_S = 0.5 * GRID_S  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
 _STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
 _APART_S = 0.05  # other places on the curve begin so far from the best
 

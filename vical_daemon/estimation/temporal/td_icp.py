@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import STRETCH_S
 from vical_daemon.estimation.temporal.orientation_fit import Fit, polish
 from vical_daemon.estimation.temporal.orientation_problem import OrientationSensor
 from vical_daemon.estimation.temporal.rotation_curves import OrientationCurve
@@ -41,9 +42,10 @@ from vical_daemon.estimation.temporal.td_icp_result import (
     pair_delays,
 )
 
-ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
-_DOUBTFUL_RAD = float(np.deg2rad(0.5))
-"""Noise of one orientation above which the usual mistakes are tried out."""
+DOUBTFUL_RAD = float(np.deg2rad(0.5))
+"""Noise of one orientation above which the usual mistakes are tried out, or a target is said to be too far
+away. Targets that fill the image have 0.04 to 0.3 deg (12 random rigs); of four times as far away those with
+which a start fails 0.6 to 2 deg (four of 8)."""
 _MOST = 3000  # orientations of several sensors in all; more would add minutes and little accuracy
 
 
@@ -132,7 +134,7 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
     start, bias = reference.start(data.t_s, data.q, reach)
 
     def mistake() -> str:
-        long = data.t_s[-1] - data.t_s[0] >= ENOUGH_S
+        long = data.t_s[-1] - data.t_s[0] >= STRETCH_S  # in less any mistake can be made to fit
         return explain(reference, data.t_s, data.q, reach, start) if long else ""
 
     reason = refuse_start(start, options, reference, data.t_s, data.q)
@@ -151,7 +153,7 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
     except np.linalg.LinAlgError:
         result = _refused(data, f"the orientations do not fit the {reference.name} at any delay")
     uneven = abs(result.stamp_rate) > 3.0 * result.stamp_rate_sigma and result.status == DEGENERATE
-    if result.camera_noise_rad < _DOUBTFUL_RAD and not uneven:
+    if result.camera_noise_rad < DOUBTFUL_RAD and not uneven:
         return result
     reason = mistake()
     return _refused(data, reason) if reason else result

@@ -14,9 +14,11 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import (
+    GRID_S,
     GyroReference,
     Reference,
     Start,
@@ -33,13 +35,13 @@ _AGREE = 0.6  # share of the turns that agree in size where stamps are no longer
 BETTER = 0.6  # misfit over that of the data as they are
 _MOST = 0.22  # by which stamps may be stretched: 30 images a second counted as 25 are 0.2
 _STEP = 0.02  # between the factors tried; a quarter of it about the best
-_GRID_S = 0.02  # of the shifts tried with each factor
+_GRID_S = 2.0 * GRID_S  # of the shifts tried with each factor
 _LONGEST_S = 12.0  # of the data looked at: with more, the factors would have to be closer
 _TURNS = 80  # enough to tell factors apart
 _CLEARLY = 5.0  # so many times as fast as a sensor that rests another one surely moves
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
-_SHIFT_LOST_S = 3e-3  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
-_ROTATION_LOST_RAD = float(np.deg2rad(3.0))  # likewise of a mounting, which by eye is known as well
+_SHIFT_LOST_S = 3.0 * SHIFT_SIGMA_S  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
+_ROTATION_LOST_RAD = 3.0 * ROTATION_SIGMA_RAD  # likewise of a mounting, which by eye is known as well
 _UNITS = {
     np.pi / 180.0: "look like degrees per second (factor 57.3); convert them to rad/s",
     180.0 / np.pi: "look as if divided by 57.3 once too often; they must be in rad/s",

@@ -12,9 +12,10 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames
+from vical_daemon.estimation.significance import STRETCH_S
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.stretch_agreement import STRETCHES, scatter_factors
-from vical_daemon.estimation.temporal.td_icp import ENOUGH_S, td_icp
+from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
@@ -47,7 +48,7 @@ def track_registration(
         return TdIcpResult(REFUSED, imu, rejected=len(frames))
     windows = _windows(frames)
     if not windows:
-        reason = f"the tracks cover less than {ENOUGH_S:g} s without a hole"
+        reason = f"the tracks cover less than {STRETCH_S:g} s without a hole"
         return TdIcpResult(REFUSED, reason, rejected=len(frames))
     options = options or TdIcpOptions()
     start = _start(imu, windows, lens, options)
@@ -81,7 +82,7 @@ def _windows(frames: Frames) -> list[Frames]:
         ):
             stretches.append([])
         stretches[-1].append(frame)
-    long = [s for s in stretches if s[-1][0] - s[0][0] >= ENOUGH_S]
+    long = [s for s in stretches if s[-1][0] - s[0][0] >= STRETCH_S]
     if len(long) > STRETCHES:
         long = [long[i] for i in np.linspace(0, len(long) - 1, STRETCHES).round().astype(int)]
     return long

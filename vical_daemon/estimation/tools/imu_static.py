@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_model import products
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import STANDARD_GRAVITY_MPS2, FloatArray
 from vical_daemon.estimation.model.state import LOWER
 from vical_daemon.estimation.temporal.orientation_problem import LEAST_NOISE_RAD
 
@@ -135,7 +135,7 @@ def _standard_error(samples: FloatArray) -> FloatArray:
 
 
 def calibrate_imu(
-    gyro_rps: FloatArray, accel_mps2: FloatArray, rate_hz: float, gravity_mps2: float = 9.80665,
+    gyro_rps: FloatArray, accel_mps2: FloatArray, rate_hz: float, gravity_mps2: float = STANDARD_GRAVITY_MPS2,
     min_rest_s: float = 1.0, gravity_sigma_mps2: float = 0.0,
 ) -> ImuCalibration:  # fmt: skip
     """Calibrate both triads from one recording of rests and turns.
@@ -165,7 +165,9 @@ def calibrate_imu(
     return ImuCalibration(accel, gyro, found, len(rests), motions)
 
 
-def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) -> SensorCalibration:
+def calibrate_accelerometer(
+    rests: list[Rest], gravity_mps2: float = STANDARD_GRAVITY_MPS2
+) -> SensorCalibration:
     """Fit M_a (lower triangular) and b_a so that every rest shows gravity's length.
 
     Raises:
