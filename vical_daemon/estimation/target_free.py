@@ -31,6 +31,7 @@ from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
+from vical_daemon.estimation.robust import MOST_STEPS
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE_EFFECT
 from vical_daemon.estimation.significance import LIKELY_SIGMAS
 from vical_daemon.estimation.smoother.bundle import LEAST_PARALLAX, Bundle, Fit, window_reports
@@ -56,7 +57,6 @@ WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its
 WINDOW_S = 6.0  # likewise, see `WINDOW_FRAMES`
 _KEEP_S = 2.0 * WINDOW_S  # of images that wait for a start or for inertial data
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
-_STEPS_GROW = 12  # Gauss-Newton steps for a window that grows; twice as many for its last fit
 _ALWAYS = frozenset({IMU, LAG, SIZE_EFFECT, "readout"})  # is estimated besides what is asked for
 
 
@@ -342,7 +342,7 @@ class TargetFreeCalibrator:
         if len(window.frames) < 8:
             return
         bundle = Bundle(window, self.carry, self._noise)
-        fit = bundle.solve(self._buffer, 2 * _STEPS_GROW if _full(window) else _STEPS_GROW)
+        fit = bundle.solve(self._buffer, MOST_STEPS if _full(window) else MOST_STEPS // 2)
         if fit is None:
             self._lost(Cause.TOO_FEW_FEATURES)
             return

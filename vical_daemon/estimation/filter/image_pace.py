@@ -14,6 +14,7 @@ from collections import deque
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.stamp_steps import LEARN
 from vical_daemon.estimation.inertial.white_noise import measured_gyro_density
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.rates import RATE_BLOCK_S
@@ -23,7 +24,6 @@ _TIMES = 2.0
 """Change of the rate from one image to the next, over its noise. At 2 the noise adds a quarter to the
 information, so that sigmas are 11 % too small."""
 _LONGEST_S = 0.1  # between images: with fewer than ten a second other weaknesses of slow cameras show
-_LATEST = 31  # intervals of which the median is taken
 
 
 class ImagePace:
@@ -85,7 +85,7 @@ class Thinning:
     """
 
     def __init__(self) -> None:
-        self._intervals_s: deque[float] = deque(maxlen=_LATEST)
+        self._intervals_s: deque[float] = deque(maxlen=LEARN)  # their median is the usual one
         self._before_s: float | None = None
         self._left_out = 0
 

@@ -41,7 +41,7 @@ UNKNOWN_S = 0.3
 UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
 """Sigma of an unknown angle: all are equally likely."""
 _RECENT_S = 0.3  # of images by which an axis is seen to turn: 17 deg/s
-_HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6  # sigmas of what motion does not show yet: as good as known
+_HELD = 1e-6  # sigma, s, s/s or rad, of what motion does not show yet: as good as known
 
 
 @dataclass(slots=True)
@@ -75,10 +75,10 @@ class UnobservableDirections:
         if where.rotation is not None:
             held = np.outer(self.turn_axis_cam, self.turn_axis_cam)
             free = root[where.rotation, where.rotation]
-            root[where.rotation, where.rotation] = free @ (np.eye(3) - held) + _HELD_RAD * held
+            root[where.rotation, where.rotation] = free @ (np.eye(3) - held) + _HELD * held
         if where.timeshift is not None and where.skew is not None:
-            root[where.timeshift, where.timeshift] = _HELD_S
-            root[where.skew, where.skew] = _HELD_SKEW
+            root[where.timeshift, where.timeshift] = _HELD
+            root[where.skew, where.skew] = _HELD
 
     def turned(self, f: CalibrationFilter) -> bool:
         """Look at the filter after an image: whether what is held turns now, so that it must not be held."""

@@ -28,7 +28,9 @@ MIN_POINTS = 8  # of a view: two tags, or corners enough to see an outlier among
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4  # both poses of a plane have become one: far below the noise of any view
-_TOGETHER = 64  # views in one batch: beyond, arrays leave the cache, and nothing is gained
+TOGETHER = (
+    64  # views, or pairs of images, in one batch: beyond, arrays leave the cache, and nothing is gained
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +117,8 @@ def planar_poses(
     """
     if not len(xy):
         return []
-    if len(xy) > _TOGETHER:
-        parts = [slice(k, k + _TOGETHER) for k in range(0, len(xy), _TOGETHER)]
+    if len(xy) > TOGETHER:
+        parts = [slice(k, k + TOGETHER) for k in range(0, len(xy), TOGETHER)]
         return [found for part in parts for found in planar_poses(points_m[part], xy[part], sigma)]
     views = _Views.of(points_m, xy)
     out = [PlanarPoses(()) for _ in xy]

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from vical_daemon.estimation.inertial.stamp_steps import LEARN
+from vical_daemon.estimation.inertial.stamp_steps import FADES, LEARN
 
 T = TypeVar("T")
 Six = Sequence[float]
@@ -33,8 +33,6 @@ _MORE = 2
 """So many readings more at that value may be chance: only the way up to the crest may have been seen yet."""
 _NEAR = 0.9
 """Of the extreme: where values are close to it."""
-_SAME_RANGE = 0.99
-"""Of the largest channel: as large are the others where all three are at the range of their sensor."""
 _VALUES = 64
 """Different values close to the extreme that are counted."""
 _SPIKE = 10.0
@@ -42,8 +40,6 @@ _SPIKE = 10.0
 _HARMFUL = (0.1, 1.0)
 """Smaller spikes are left in, rad/s and m/s^2: at 100 Hz one such reading turns the attitude by 1 mrad and
 changes the velocity by 10 mm/s, about what one image leaves open."""
-_FADES = 1.0 - 1.0 / 200.0
-"""Of that largest error, a reading: some hundred readings are remembered."""
 _CHANNELS = ((0, 1, 2, 6, 7, 8), (3, 4, 5, 9, 10, 11))
 """Of each sensor, upwards and downwards."""
 
@@ -184,7 +180,7 @@ def _measured_anew(three: Six, previous: Six) -> bool:
     if three != previous:
         return True
     sizes = [abs(x) for x in three]
-    return min(sizes) > _SAME_RANGE * max(sizes)
+    return min(sizes) > _NEAR * max(sizes)
 
 
 class SpikeFilter(Generic[T]):
@@ -287,7 +283,7 @@ class SpikeFilter(Generic[T]):
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
         (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
         if not math.isnan(gyro):  # one that was not noticed at most doubles it
-            fades_gyro, fades_accel = _FADES * usual_gyro, _FADES * usual_accel
+            fades_gyro, fades_accel = FADES * usual_gyro, FADES * usual_accel
             self._largest = (
                 fades_gyro if gyro <= fades_gyro else min(gyro, 2.0 * usual_gyro),
                 fades_accel if accel <= fades_accel else min(accel, 2.0 * usual_accel),

@@ -22,7 +22,7 @@ LEARN = 20  # readings by which the usual interval is known, and how well the mo
 _LEAST_S = 1e-4
 """Smaller steps are like jitter. Stamps that deviate by half as much from an even grid were not made by a
 device's clock."""
-_FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval
+FADES = 1.0 - 1.0 / 500.0  # of a largest deviation, a reading: some hundred are remembered
 _MOST = 0.55  # of an interval
 _SETTLED = 4  # readings after which a step is one: a single late stamp is followed by a short interval
 _SPREAD = 0.5
@@ -89,7 +89,7 @@ class StampSteps:
             return
         if size_s < _LEAST_S:
             self._period_s += 0.01 * deviation_s
-        self._largest_s = max(size_s, self._largest_s * _FADES)
+        self._largest_s = max(size_s, self._largest_s * FADES)
         if self._since:
             self._since -= 1
             if not self._since:

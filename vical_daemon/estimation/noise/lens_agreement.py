@@ -17,13 +17,12 @@ from scipy.special import chdtri
 from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.next_term import onto_model
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS, FILTER_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import RIDGE, root, solve_lower, unit
 from vical_daemon.estimation.noise.lens_limit import WINDOWS
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, PERHAPS_SIGMAS, STRETCH_S, chance
 
-_WEAK = 0.1  # of the focal length: as good as nothing known
-_WEAK_DISTORTION = 0.5  # of a coefficient: likewise
 # the two highest powers of the radius among fx fy cx cy and the distortion
 _RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
 _LEAST = 3  # stretches: with two, one difference would stand for all scatter
@@ -85,7 +84,8 @@ class LensAgreement:
 
 def lens_sigmas(focal_px: float, n: int) -> FloatArray:
     """Standard deviations of fx fy cx cy and n - 4 coefficients of which as good as nothing is known."""
-    return np.array([_WEAK * focal_px] * 4 + [_WEAK_DISTORTION] * (n - 4))
+    known = [FILTER_START.focal * focal_px] * 4 + [FILTER_START.distortion] * (n - 4)
+    return AGAIN_SIGMAS * np.array(known)
 
 
 def with_next_power(by_lens: FloatArray, model: str) -> FloatArray:

@@ -26,12 +26,12 @@ from vical_daemon.estimation.smoother.inertial import links_left, moves
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
 from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
+from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 _OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
-_LEAST_LANDMARKS = 8  # as many as the eight-point algorithm needs
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _BOUNDS = 0.2, 5.0  # of an inverse distance after a step, over that before it
 _ROUNDS = 4  # of looking for distances that a step would move beyond their bounds
@@ -165,7 +165,7 @@ class Bundle:
     def _present(self) -> _Present | None:
         """The window as it is given; None where too few features are followed."""
         seen = self.window.observe()
-        if len(seen.begin) < _LEAST_LANDMARKS:
+        if len(seen.begin) < MIN_FEATURES:
             return None
         view = self.problem.view(seen)
         return _Present(view, self.problem.normal(view))
@@ -187,7 +187,7 @@ class Bundle:
 
     def _relinearised(self, now: _Present, buffer: ImuBuffer) -> _Present | None:
         """Normal equations about what has changed; None where readings or features do not reach."""
-        if len(now.view.seen.begin) < _LEAST_LANDMARKS:
+        if len(now.view.seen.begin) < MIN_FEATURES:
             return None
         if self.window.stale():
             if not self.window.relink(buffer):

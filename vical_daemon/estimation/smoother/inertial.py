@@ -18,13 +18,14 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.noise.shared_errors import JITTERS_S, SHIFTS_PX
 from vical_daemon.estimation.robust import MEDIAN_CHI2, MOST_STEPS
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
 
 LATE, SHIFTED = slice(0, 1), slice(1, 3)
 """The ways in which an image may be off: late (s); to the side and down (px)."""
-FLOORS = np.array([2e-5, 2e-2, 2e-2])  # s, px, px: less is none; with a board the grid of shifts begins there
+FLOORS = np.array([JITTERS_S[1], SHIFTS_PX[1], SHIFTS_PX[1]])  # s, px, px: less is none, as with a board
 
 
 class Order:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.planar_pose import TOGETHER
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.robust import MEDIAN_ABSOLUTE, geman_mcclure_weight
@@ -22,7 +23,6 @@ from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
 _STEPS = 12  # Gauss-Newton steps of one pair of images; outliers are put aside in the second half
-_AT_ONCE = 32  # pairs in one batch of arrays: beyond, they leave the cache
 
 Pair = tuple[FloatArray, FloatArray]
 
@@ -101,8 +101,8 @@ def relative_rotations(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] 
         error for rays with unit noise, shape (3, 3); None where the points do not determine it.
     """
     out: list[tuple[FloatArray, FloatArray] | None] = []
-    for k in range(0, len(pairs), _AT_ONCE):
-        out += _adjusted(pairs[k : k + _AT_ONCE])
+    for k in range(0, len(pairs), TOGETHER):
+        out += _adjusted(pairs[k : k + TOGETHER])
     return out
 
 
