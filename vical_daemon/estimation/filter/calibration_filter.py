@@ -44,6 +44,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
@@ -384,7 +385,7 @@ class CalibrationFilter:
 
         Args:
             motion: The new motion, independent of the filter's state; of another recording also its
-                biases and gravity.
+                biases and gravity, which are known as well as at any start.
         """
         state, dt, root = self.state, motion.elapsed_s, np.diag(motion.sigmas)
         if motion.turned is not None:
@@ -392,8 +393,8 @@ class CalibrationFilter:
         size_rows = np.zeros((0, self.layout.size))  # gravity has the size that it had
         if motion.biases is not None:
             b = motion.biases
-            sigmas = np.repeat([b.gyro_bias_sigma, b.accel_bias_sigma], 3)
-            root = block_diag(root, np.diag(sigmas), gravity_root(b.gravity, b.gravity_sigma, 0.0))
+            sigmas = np.repeat([GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2], 3)
+            root = block_diag(root, np.diag(sigmas), gravity_root(b.gravity, GRAVITY_SIGMA_RAD, 0.0))
             before, after = (g / np.linalg.norm(g) for g in (state.gravity, b.gravity))
             size_rows = np.outer(after, before @ self.S[GRAVITY])
             state.gyro_bias, state.accel_bias, state.gravity = b.gyro_bias, b.accel_bias, b.gravity

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -121,9 +121,26 @@ class SensorIntake:
         return self._imu.shift_s + self._images.offset_s(camera)
 
     def by_present_stamps(self, estimate: CalibrationEstimate, limit_s: float) -> CalibrationEstimate:
-        """Return an estimate with time shifts by the stamps as they come now; `limit_s`: see there."""
-        offsets = {name: self.offset_s(name) for name in estimate.cameras}
-        return by_present_stamps(estimate, offsets, self.stamp_sigma_s, limit_s)
+        """Return an estimate made on axes without steps, with time shifts by the stamps as they come now.
+
+        It has not converged while the stamps themselves are known worse than a time shift must be.
+
+        Args:
+            estimate: By axes without steps.
+            limit_s: Largest sigma of a time shift that has converged, s.
+        """
+        stamp_sigma_s = self.stamp_sigma_s  # no image can show that
+        estimated = any(e.timeshift_sigma_s for e in estimate.cameras.values())
+        if estimate.status is Status.CONVERGED and estimated and stamp_sigma_s > limit_s:
+            reason = f"stamps are known to {1e3 * stamp_sigma_s:.1f} ms only, by how they arrive"
+            progress = min(estimate.progress, NEARLY)
+            estimate = replace(estimate, status=Status.CONVERGING, reason=reason, progress=progress)
+        cameras = {}
+        for name, camera in estimate.cameras.items():
+            shift_s, sigma_s = camera.timeshift_cam_imu_s + self.offset_s(name), camera.timeshift_sigma_s
+            sigma_s = math.hypot(sigma_s, stamp_sigma_s) if sigma_s else 0.0
+            cameras[name] = replace(camera, timeshift_cam_imu_s=shift_s, timeshift_sigma_s=sigma_s)
+        return replace(estimate, cameras=cameras)
 
 
 @dataclass(slots=True)
@@ -307,35 +324,6 @@ class ImageIntake:
         """Gaps and steps since the last call."""
         news, self._news = self._news, []
         return news
-
-
-def by_present_stamps(
-    estimate: CalibrationEstimate, offsets_s: Mapping[str, float], stamp_sigma_s: float, limit_s: float
-) -> CalibrationEstimate:
-    """Return an estimate made on axes without steps, with time shifts by the stamps as they come now.
-
-    It has not converged while the stamps themselves are known worse than a time shift must be.
-
-    Args:
-        estimate: By axes without steps.
-        offsets_s: Added to the time shift of each camera, s.
-        stamp_sigma_s: How well stamps are known now, s; no image can show that.
-        limit_s: Largest sigma of a time shift that has converged, s.
-    """
-    estimated = any(e.timeshift_sigma_s for e in estimate.cameras.values())
-    if estimate.status is Status.CONVERGED and estimated and stamp_sigma_s > limit_s:
-        reason = f"stamps are known to {1e3 * stamp_sigma_s:.1f} ms only, by how they arrive"
-        progress = min(estimate.progress, NEARLY)
-        estimate = replace(estimate, status=Status.CONVERGING, reason=reason, progress=progress)
-    cameras = {
-        name: replace(
-            e,
-            timeshift_cam_imu_s=e.timeshift_cam_imu_s + offsets_s[name],
-            timeshift_sigma_s=math.hypot(e.timeshift_sigma_s, stamp_sigma_s) if e.timeshift_sigma_s else 0.0,
-        )
-        for name, e in estimate.cameras.items()
-    }
-    return replace(estimate, cameras=cameras)
 
 
 def _same(a: PointsFrame, b: PointsFrame) -> bool:

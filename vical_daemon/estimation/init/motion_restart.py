@@ -32,12 +32,7 @@ from vical_daemon.estimation.init.linear_start import (
 )
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, pose_of
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
-from vical_daemon.estimation.model.priors import (
-    ACCEL_BIAS_SIGMA_MPS2,
-    AGAIN_SIGMAS,
-    GRAVITY_SIGMA_RAD,
-    GYRO_BIAS_SIGMA_RPS,
-)
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
     POSITION,
@@ -326,14 +321,7 @@ class RecordingStart(MotionRestart):
             return None
         start = _linear(found, poses.p, state)
         wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
-        biases = BiasStart(
-            gyro_bias,
-            start.accel_bias,
-            start.gravity,
-            GYRO_BIAS_SIGMA_RPS,
-            ACCEL_BIAS_SIGMA_MPS2,
-            GRAVITY_SIGMA_RAD,
-        )
+        biases = BiasStart(gyro_bias, start.accel_bias, start.gravity)
         return MotionStart(
             float(poses.t_s[0]), poses.R[0], start.p_world_cam, start.v_world_imu, wide, 0.0, biases
         )

@@ -272,18 +272,12 @@ class BiasStart(NamedTuple):
     Attributes:
         gyro_bias: rad/s, shape (3,).
         accel_bias: m/s^2, shape (3,).
-        gravity: Acceleration of free fall in the world, m/s^2.
-        gyro_bias_sigma: rad/s.
-        accel_bias_sigma: m/s^2.
-        gravity_sigma: Of its direction, rad. Its size is that of before.
+        gravity: Acceleration of free fall in the world, m/s^2; its size is that of before.
     """
 
     gyro_bias: FloatArray
     accel_bias: FloatArray
     gravity: FloatArray
-    gyro_bias_sigma: float
-    accel_bias_sigma: float
-    gravity_sigma: float
 
 
 class MotionStart(NamedTuple):

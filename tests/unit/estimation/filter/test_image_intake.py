@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.filter.sensor_intake import ImageIntake, by_present_stamps
+from vical_daemon.estimation.filter.sensor_intake import ImageIntake, SensorIntake
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.wording import event_text
@@ -180,7 +180,9 @@ def test_nothing_has_converged_while_the_stamps_are_known_worse(shift_sigma_s, s
     known = CalibrationEstimate(
         1, Status.CONVERGED, "", 1.0, "", 30.0, 300, 3000, {"cam0": camera}, None, [], 1.0, 0.0
     )
-    shown = by_present_stamps(known, {"cam0": 0.0}, stamp_sigma_s, limit_s=5e-4)
+    intake = SensorIntake()
+    assert intake.stamps_known_to(stamp_sigma_s)
+    shown = intake.by_present_stamps(known, limit_s=5e-4)
     assert shown.status is status
     assert (shown.progress == 1.0) == (status is Status.CONVERGED)  # "converging 100 %" puzzles
     assert ("known to 5.4 ms" in shown.reason) == (status is Status.CONVERGING)
