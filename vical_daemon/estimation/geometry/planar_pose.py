@@ -28,9 +28,7 @@ MIN_POINTS = 8  # of a view: two tags, or corners enough to see an outlier among
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4  # both poses of a plane have become one: far below the noise of any view
-TOGETHER = (
-    64  # views, or pairs of images, in one batch: beyond, arrays leave the cache, and nothing is gained
-)
+TOGETHER = 64  # views, or pairs of images, in one batch: with more, arrays leave the cache
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,10 +27,11 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.noise.shared_errors import TELLING
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, PERHAPS_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 MODES = 8  # of an image: the degrees of freedom of a homography
+_TELLING = 30
+"""Images after which a model that fits is believed to: sums over six of them are known to 20 %."""
 _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
 """Errors of lens, target and motion change within so long: a board crosses the image, a hand turns back. On
 EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
@@ -193,7 +194,7 @@ class Consistency:
         """
         if self.scale != 1.0 or self._lasting >= 1.0:
             return False
-        return True if self._weight >= TELLING else None
+        return True if self._weight >= _TELLING else None
 
     @property
     def level(self) -> float:

@@ -21,7 +21,7 @@ from vical_daemon.estimation.noise.variance_components import SIZE, Observed, gr
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 MEMORY = 400  # images by which a noise is known
-TELLING = 50  # images; the correlation of neighbours is then known to 0.14
+_TELLING = 50  # images; the correlation of neighbours is then known to 0.14
 _EVERY = 20  # images that are added together; nothing is said before, unless a start said it
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
@@ -141,7 +141,7 @@ class SharedErrors:
         """
         n = min(self.images, MEMORY)
         size = self._A[:n, way, way]
-        if n < TELLING or not (size > 0.0).all() or sigma == 0.0:
+        if n < _TELLING or not (size > 0.0).all() or sigma == 0.0:
             return math.inf
         late, usual = self._b[:n, way] / size, self._C[:n, way, way] / size**2
         weight = 1.0 / (usual + sigma**2)
