@@ -17,13 +17,13 @@ from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigma
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
-from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 
 _GRAVITY = (
     "gravity comes out as {:.2f} m/s^2 instead of {:.2f}: "
     "check the target's size in its YAML and the unit of the accelerometer"
 )
 _STRETCH_S = 10.0  # of the latest poses: biases are constant over it
+_LEAST_POSES = 15  # in it
 _NEAR_S = 0.5  # the gyro carries an attitude so far: 1 % of scale is 0.3 deg at 1 rad/s
 
 
@@ -109,9 +109,9 @@ def motion_start(
         since = max(buffer.oldest_s, poses[-1].t_cam_s + camera.timeshift_s - _STRETCH_S)
         inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
         used += inside
-        if len(inside) < MIN_ORIENTATIONS:
+        if len(inside) < _LEAST_POSES:
             seen = f"{len(inside)} images of the board in the latest {_STRETCH_S:.0f} s"
-            return StartResult(None, f"{name}: {seen}, a start needs {MIN_ORIENTATIONS}")
+            return StartResult(None, f"{name}: {seen}, a start needs {_LEAST_POSES}")
         R, p, sigma, t = _poses_of_imu(inside, camera)
         R = by_neighbours(buffer, t, R, gyro_bias)
         axes: FloatArray | None = None
