@@ -283,7 +283,7 @@ function thinned(rows) { // as in web/state.py
 
 function take(message, full) {
   page.heard = performance.now();
-  page.heardAt = performance.now();
+  page.heardAt = Date.now();
   setText("rig", message.rig);
   document.title = `vical ${message.rig}`;
   if (full) {
@@ -333,7 +333,7 @@ function connectAnew() {
 // A clock of the page may stand still while a phone sleeps; the wall clock does not.
 document.addEventListener("visibilitychange", () => {
   if (document.hidden || !page.heard) return;
-  if (performance.now() - page.heardAt > SILENT_MS) connectAnew();
+  if (Math.abs(Date.now() - page.heardAt) > SILENT_MS) connectAnew(); // a clock that is set back counts, too
   drawCharts();
 });
 
