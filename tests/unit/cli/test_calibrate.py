@@ -364,7 +364,7 @@ def test_several_recordings_are_one_calibration(euroc: Path, tmp_path: Path, cap
     html = report.read_text()
     assert "Recordings" in html and str(other) in html
     text = calibration_text.describe(result)
-    assert f"{other}: 8.0 s" in text
+    assert f"{other}: 12.0 s" in text
 
 
 def test_a_recording_that_cannot_start_is_tried_again_after_the_others(
