@@ -209,9 +209,9 @@ class CalibrationFilter:
         score = self._arm_score(image, lin, fit)
         self.arm_scores = self.arm_scores + score
         before = self.S
-        self._accept(fit.S, fit.dx + self._step_by(score, fit.S), image.camera)
+        after, carried = self._accept(fit.S, fit.dx + self._step_by(score, fit.S), image.camera)
         rows = fit.rows if lin.curved.size else (fit.ways, fit.r)
-        self.passed.append(Corrected(before, self.S, *rows, lin.moves))
+        self.passed.append(Corrected(before, after, carried, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None]
@@ -310,10 +310,16 @@ class CalibrationFilter:
         straight.measured(sigmas, curved_share(image, lin, lin.valid))
         return self._with_shared(image, lin)
 
-    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> None:
-        """Take a correction by an image of a camera: square root of the covariance, and step of the state."""
+    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> tuple[FloatArray, FloatArray]:
+        """Take a correction by an image of a camera: square root of the covariance, and step of the state.
+
+        Returns:
+            The square root, and what its columns are as errors of the new state.
+        """
         jumps = None if self.jumped is None else self.jumped.D
-        self.state, self.S = move(self.state, self.layout, S, dx, camera, jumps)
+        moved = move(self.state, self.layout, S, dx, camera, jumps)
+        self.state, self.S = moved.state, moved.S
+        return moved.before, moved.carried
 
     def step(self, dx: FloatArray) -> None:
         """Move the nominal state by errors, shape (n,); what is known of them stays."""

@@ -59,7 +59,8 @@ class Corrected(NamedTuple):
 
     Attributes:
         before: Square root of the covariance as predicted, shape (n, n).
-        after: Likewise, of the corrected state.
+        after: Likewise, of the corrected state, by the same errors.
+        carried: What its columns are as errors of the corrected state, see `Reset`, shape (n, n).
         ways: The whitened corners by the ways in which the image can move, shape (m, w).
         innovation: Theirs, shape (m,).
         moves: Square root of how far the state, and then what corners share, move the image: (w, c).
@@ -67,6 +68,7 @@ class Corrected(NamedTuple):
 
     before: FloatArray
     after: FloatArray
+    carried: FloatArray
     ways: FloatArray
     innovation: FloatArray
     moves: FloatArray
@@ -107,8 +109,9 @@ class JumpScores(NamedTuple):
         information, weighted = np.zeros((len(run), p, p)), np.zeros((len(run), p))
         for k in range(len(run) - 1, -1, -1):
             for done in reversed(run[k]):
-                if done.after is not root:  # an error was reopened
-                    A, b = _before(A, b, solve_lower(root, done.after))
+                after = done.carried if isinstance(done, Corrected) else done.after
+                if after is not root:  # an error was reopened, or errors mean something else now
+                    A, b = _before(A, b, solve_lower(root, after))
                 A, b = _before(A, b, _by_step(done, drifts))
                 if isinstance(done, Corrected):
                     J, j = _said(done)

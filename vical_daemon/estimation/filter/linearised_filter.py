@@ -166,6 +166,7 @@ class LinearisedFilter(CalibrationFilter):
         score[-1] = 0.0
         return score
 
-    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> None:  # noqa: ARG002
+    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
         """Move the mean; the reference stays."""
         self.S, self.offset = S, self.offset + dx
+        return S, S

@@ -26,10 +26,26 @@ _TURNED_RAD = 5e-5  # half a turn below which the covariance of a rotation stays
 _MOVED = 1e-3  # change of how errors move a camera, over how far they move it, below which it stays
 
 
+class Reset(NamedTuple):
+    """A state after a correction.
+
+    Attributes:
+        state: The state.
+        S: Lower-triangular square root of its covariance, shape (n, n).
+        before: The same by errors of before, but for turns.
+        carried: The errors that its columns have become, shape (n, n).
+    """
+
+    state: State
+    S: FloatArray
+    before: FloatArray
+    carried: FloatArray
+
+
 def move(
     state: State, layout: Layout, S: FloatArray, dx: FloatArray, camera: str, jumps: FloatArray | None = None
-) -> tuple[State, FloatArray]:
-    """Return the state moved by a correction, and the square root of its covariance.
+) -> Reset:
+    """Move a state by a correction, and the square root of its covariance with it.
 
     Args:
         state: Nominal state; not changed.
@@ -53,11 +69,13 @@ def move(
     moved.p_world_imu = p_cam - after.arm
     seen = before.by(S)
     more = seen - after.by(S)
-    if (np.vecdot(more, more) > _MOVED**2 * np.vecdot(seen, seen)).any():
-        for X in columns:
-            X[POSITION] += before.by(X) - after.by(X)
-        S = unscented.lower_root(S)
-    return moved, S
+    if (np.vecdot(more, more) <= _MOVED**2 * np.vecdot(seen, seen)).all():
+        return Reset(moved, S, S, S)
+    carried = S.copy()
+    columns[0] = carried
+    for X in columns:
+        X[POSITION] += before.by(X) - after.by(X)
+    return Reset(moved, unscented.lower_root(carried), S, carried)
 
 
 class CameraMoves(NamedTuple):

@@ -49,7 +49,7 @@ def run(F, images, jump_at=None, size=1.0):
         K = P @ H.T @ np.linalg.inv(V)
         mean, P = mean + K @ r, P - K @ H @ P
         after = np.linalg.cholesky(P)
-        seen = Corrected(L, after, ways, r, by_error @ L)
+        seen = Corrected(L, after, after, ways, r, by_error @ L)
         mean, P = F @ mean, F @ P @ F.T + NOISE
         passed.append([seen, Moved(after, np.linalg.cholesky(P), F[:9, :9] @ after[:9, :9], SECONDS)])
     return total, JumpScores.of(passed, [columns] * IMAGES, DRIFTS)

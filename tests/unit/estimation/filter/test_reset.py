@@ -42,7 +42,7 @@ def camera_m(state, name):
 def test_a_camera_moves_by_exactly_what_the_errors_say(seed):
     state, layout, S = wide(seed)
     dx = S @ np.random.default_rng(seed + 10).standard_normal(layout.size)
-    moved, _ = move(state, layout, S.copy(), dx, "cam0")
+    moved = move(state, layout, S.copy(), dx, "cam0").state
     by = camera_m(moved, "cam0") - camera_m(state, "cam0")
     assert by == pytest.approx(CameraMoves.of(state, layout, "cam0").by(dx), abs=1e-12)
     arms = [moved.cameras[n].p_imu_cam - state.cameras[n].p_imu_cam for n in layout.cameras]
@@ -56,7 +56,7 @@ def test_what_is_known_of_the_cameras_position_stays_as_it_was(seed):
     jumps = S[:, :4].copy()
     before = CameraMoves.of(state, layout, "cam0").by(S)
     jumps_before = CameraMoves.of(state, layout, "cam0").by(jumps)
-    moved, after = move(state, layout, S.copy(), dx, "cam0", jumps)
+    moved, after, *_ = move(state, layout, S.copy(), dx, "cam0", jumps)
     now = CameraMoves.of(moved, layout, "cam0").by(after)
     assert now @ now.T == pytest.approx(before @ before.T, rel=1e-6)
     assert CameraMoves.of(moved, layout, "cam0").by(jumps) == pytest.approx(jumps_before, rel=1e-9, abs=1e-15)
@@ -73,14 +73,17 @@ def test_other_columns_of_errors_are_changed_like_the_covariance(size):
     share = rng.standard_normal((layout.size, 3))
     jumps = S @ share
     dx = size * S @ rng.standard_normal(layout.size)
-    _, after = move(state, layout, S.copy(), dx, "cam0", jumps)
+    _, after, before, carried = move(state, layout, S.copy(), dx, "cam0", jumps)
     now = np.linalg.solve(after, jumps)
     np.testing.assert_allclose(now.T @ now, share.T @ share, rtol=1e-8)
+    turned = np.linalg.solve(after, carried)
+    np.testing.assert_allclose(turned.T @ turned, np.eye(layout.size), atol=1e-8)
+    assert (before is after) is (size == 1e-6)
 
 
 def test_a_small_step_leaves_the_covariance(recwarn):
     state, layout, S = wide(0)
-    moved, after = move(state, layout, S.copy(), 1e-6 * S[:, 0], "cam0")
+    moved, after, *_ = move(state, layout, S.copy(), 1e-6 * S[:, 0], "cam0")
     assert (after == S).all()
     assert not recwarn.list
     assert moved.p_world_imu == pytest.approx(state.p_world_imu, abs=1e-6)

@@ -15,7 +15,7 @@ def images(f, innovation):
     """Three images in which the camera turns, each of them with an innovation over its noise."""
     frame = PointsFrame(NAME, 0, np.arange(8), np.zeros((8, 2)))
     moves = 2.0 * f.S[f.layout.cameras[NAME].rotation]
-    done = [Corrected(f.S, f.S, np.eye(3), innovation, moves)]
+    done = [Corrected(f.S, f.S, f.S, np.eye(3), innovation, moves)]
     return [Taken((0.1 * k, frame), True, 0.0, f.state, done) for k in range(3)]
 
 
