@@ -45,7 +45,7 @@ from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.significance import SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.td_icp import DOUBTFUL_RAD, td_icp
-from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
@@ -244,12 +244,13 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> tu
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
         attitude_sigmas(poses, lens),
+        TdIcpOptions(lost_s=np.inf),  # see below
     )
     long = poses[-1].t_cam_s - poses[0].t_cam_s > LONG_S
     return found, found.reason or not_sure_yet(
         found.timeshift_sigma_s,
         float(np.max(found.rotation_sigma_rad)),
-        (2.0 if long else 1.0) * SHIFT_SIGMA_S,
+        (8.0 if long else 1.0) * SHIFT_SIGMA_S,
         ROTATION_SIGMA_RAD,
     )
 

@@ -72,10 +72,10 @@ class StartSigmas(NamedTuple):
 
 
 ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = math.radians(1.0), 1e-3
-"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
+"""So well mounting and time shift must be known for a start: 0.06 deg at 60 deg/s. [docs/design/filter.md]"""
 AGAIN_SIGMAS = 5.0
 """Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
-FILTER_START = StartSigmas(0.1, 0.5, 0.3, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.1, 0.01)
+FILTER_START = StartSigmas(0.1, 0.5, 0.3, 0.1, 0.05, 0.05, 0.05, 0.1, 0.1, 0.1, 0.01)
 """With a target: the closed form has found all of it but lever arms, to about a fifth of these."""
 WINDOW_START = StartSigmas(1.0, 5.0, 0.3, 0.2, 0.05, 0.05, 0.03, 0.1, 0.01, 0.05, 0.015)
 """Without a target: next to nothing is known of the motion, and of the rest what a rig can be."""

@@ -53,7 +53,6 @@ _REACH_S = 2.0  # time shifts that are looked for, to both sides of what is give
 _NEAR_S = np.linspace(-0.2, 0.2, 5)  # time shifts about what is given, where strung-together turns show none
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0  # of images in an attempt at least; with a calibration to begin with
 _ROTATION_SIGMA_RAD = 2.0 * ROTATION_SIGMA_RAD  # of the mounting by rotations: a window converges from there
-_SHIFT_SIGMA_S = 4.0 * SHIFT_SIGMA_S  # of the time shift: likewise, 0.2 deg at 60 deg/s
 _LEAST_IMAGES, _MOST_IMAGES = 20, 120  # of a start: its cost grows with the cube
 _MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 
@@ -206,7 +205,7 @@ class TargetFreeInitializer:
         about = None
         worst = float(np.sqrt(np.max(np.diag(best.rotation_covariance))))
         most = _ROTATION_SIGMA_RAD if given is None else np.inf
-        why = not_sure_yet(best.timeshift_sigma_s, worst, _SHIFT_SIGMA_S, most)
+        why = not_sure_yet(best.timeshift_sigma_s, worst, SHIFT_SIGMA_S, most)
         if why and frames[-1][0] - frames[0][0] > PARTIAL_S:
             inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
             about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
@@ -290,7 +289,7 @@ def _best_fit(
 
 def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray | None:
     """The axis of the imu that kept its direction, where the mounting is known but for a turn about it."""
-    if axis is None or fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
+    if axis is None or fit.timeshift_sigma_s > SHIFT_SIGMA_S:
         return None
     along = fit.R_imu_cam.T @ axis
     across = np.eye(3) - np.outer(along, along)

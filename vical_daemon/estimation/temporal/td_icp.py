@@ -148,7 +148,7 @@ def _register(reference: Reference, data: CleanStream, options: TdIcpOptions) ->
     )  # fmt: skip
     try:
         fit = polish(reference.curve, (sensor,), bias + rough.bias_rps, options)
-        result = _result(fit, 0, reference, data, rough.iterations)
+        result = _result(fit, 0, reference, data, options, rough.iterations)
         result = _refused(data, result.reason) if result.status == REFUSED else result
     except np.linalg.LinAlgError:
         result = _refused(data, f"the orientations do not fit the {reference.name} at any delay")
@@ -184,7 +184,7 @@ def _joint(
         fit = polish(reference.curve, tuple(sensors), bias, options)
     except np.linalg.LinAlgError:
         return JointResult(REFUSED, "the orientations do not fit the reference together", name)
-    results = {data.name: _result(fit, i, reference, data) for i, data in enumerate(kept)}
+    results = {data.name: _result(fit, i, reference, data, options) for i, data in enumerate(kept)}
     reasons = {other: r.reason for other, r in results.items() if r.reason} | reasons
     names, covariance = list(results), fit.covariance[: 4 * len(kept), : 4 * len(kept)]
     delays = pair_delays([name, *names], [s.timeshift_s for s in fit.sensors], covariance[3::4, 3::4])
@@ -209,7 +209,9 @@ def _refused(data: CleanStream, reason: str, *, still: bool = False) -> TdIcpRes
     return TdIcpResult(REFUSED, reason, rejected=data.n_given, at_rest=data.at_rest, still=still)
 
 
-def _result(fit: Fit, i: int, reference: Reference, data: CleanStream, rounds: int = 0) -> TdIcpResult:
+def _result(
+    fit: Fit, i: int, reference: Reference, data: CleanStream, options: TdIcpOptions, rounds: int = 0
+) -> TdIcpResult:
     """What the fit says of sensor `i`, whose orientations are `data`; `rounds` were needed before."""
     sensor, S = fit.sensors[i], len(fit.sensors)
     tau, (low, high) = sensor.t_s + sensor.timeshift_s, reference.span_s
@@ -239,5 +241,5 @@ def _result(fit: Fit, i: int, reference: Reference, data: CleanStream, rounds: i
         widened=float(fit.widened[i].max()),
         sensor=sensor,
     )
-    status, reason = judge(result, len(tau), reference)
+    status, reason = judge(result, len(tau), reference, options.lost_s)
     return replace(result, status=status, reason=reason)

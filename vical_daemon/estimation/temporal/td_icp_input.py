@@ -14,6 +14,7 @@ from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 _USUAL = ImuNoise()
 USUAL_RAD = float(np.deg2rad(0.1))
 """Noise of an orientation from a board as it usually is, rad."""
+SHIFT_LOST_S = 3e-3  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
 MIN_ORIENTATIONS = 12  # 36 equations for mounting, world, bias and delay (10)
 SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen
 
@@ -28,6 +29,7 @@ class TdIcpOptions:
         gyro_density: Gyro noise density, rad/s/sqrt(Hz).
         gyro_walk: Gyro bias walk, rad/s^2/sqrt(Hz).
         gyro_log_sigma: How well the density is known (sigma of its logarithm).
+        lost_s: Sigma of a delay that is no answer, s.
     """
 
     search_s: float = 5.0
@@ -35,6 +37,7 @@ class TdIcpOptions:
     gyro_density: float = _USUAL.gyro_density
     gyro_walk: float = _USUAL.gyro_walk
     gyro_log_sigma: float = 0.2
+    lost_s: float = SHIFT_LOST_S
 
 
 LONGEST_HOLE_S = 86_400.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
+from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import (
@@ -27,7 +27,7 @@ from vical_daemon.estimation.temporal.rotation_start import (
     shift_costs,
 )
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, Turns, camera_turns
-from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, SHIFT_LOST_S, TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 
 _CLEAR = 0.25  # misfit of turns over their size below which they fit
@@ -40,7 +40,6 @@ _LONGEST_S = 12.0  # of the data looked at: with more, the factors would have to
 _TURNS = 80  # enough to tell factors apart
 _CLEARLY = 5.0  # so many times as fast as a sensor that rests another one surely moves
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
-_SHIFT_LOST_S = 3.0 * SHIFT_SIGMA_S  # sigma of a delay that is no answer: 0.2 deg at 60 deg/s
 _ROTATION_LOST_RAD = 3.0 * ROTATION_SIGMA_RAD  # likewise of a mounting, which by eye is known as well
 _UNITS = {
     np.pi / 180.0: "look like degrees per second (factor 57.3); convert them to rad/s",
@@ -295,8 +294,15 @@ def refuse_start(
     return ""
 
 
-def judge(result: TdIcpResult, of: int, reference: Reference) -> tuple[str, str]:
-    """Status and reason from the final covariance and residuals of a sensor with `of` orientations."""
+def judge(result: TdIcpResult, of: int, reference: Reference, lost_s: float) -> tuple[str, str]:
+    """Status and reason from the final covariance and residuals of a sensor with `of` orientations.
+
+    Args:
+        result: Its result so far.
+        of: Number of its orientations.
+        reference: What it was compared with.
+        lost_s: See `TdIcpOptions`.
+    """
     other, noise = reference.name, result.camera_noise_rad
     rate, rate_sigma = result.stamp_rate, result.stamp_rate_sigma
     if result.pairs < max(MIN_ORIENTATIONS, 0.25 * of):
@@ -306,16 +312,16 @@ def judge(result: TdIcpResult, of: int, reference: Reference) -> tuple[str, str]
     if noise > _ROTATION_LOST_RAD:
         degrees = f"{np.rad2deg(noise):.1f} deg (rms)"
         return REFUSED, f"{other} and {reference.sensor} disagree by {degrees} at the best delay"
-    reasons = lost_in_words(result.covariance, result.R_imu_cam)
+    reasons = lost_in_words(result.covariance, result.R_imu_cam, lost_s)
     if abs(rate) > max(_UNEVEN, SURE_SIGMAS * rate_sigma):
         reasons.append(stretched(rate, reference))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)
 
 
-def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
+def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray, lost_s: float = SHIFT_LOST_S) -> list[str]:
     """Name what a covariance [mounting, bias, shift] leaves open, and the motion that would show it."""
     reasons = []
-    if covariance[6, 6] > _SHIFT_LOST_S**2:
+    if covariance[6, 6] > lost_s**2:
         reasons.append(
             f"the delay is not determined (sigma {1e3 * np.sqrt(covariance[6, 6]):.1f} ms): "
             "the rotation rate hardly changed; turn back and forth"
