@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -23,6 +24,7 @@ from vical_daemon.estimation.filter.image_update import (
     log_likelihood,
     rows_of,
     solve,
+    whitened,
 )
 from vical_daemon.estimation.filter.jump_scores import Corrected, JumpSizes, Moved
 from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
@@ -199,7 +201,7 @@ class CalibrationFilter:
             keep = lin.valid & self._belonging(image, innovation, lin)
         if np.count_nonzero(keep) < LEAST_POINTS:
             return self._refused(image, innovation, predicted)
-        fit = solve(image, self.S, lin, keep)
+        fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
         if self._misses_gate(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
@@ -210,7 +212,7 @@ class CalibrationFilter:
         self.arm_scores = self.arm_scores + score
         before = self.S
         after, carried = self._accept(fit.S, fit.dx + self._step_by(score, fit.S), image.camera)
-        rows = fit.rows if lin.curved.size else (fit.ways, fit.r)
+        rows = whitened(image, lin, fit) if lin.curved.size else (fit.ways, fit.r)
         self.passed.append(Corrected(before, after, carried, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
         keep = fit.keep
@@ -306,9 +308,12 @@ class CalibrationFilter:
             return self._with_shared(
                 image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
             )
-        lin = by_sigma_points(self.state, self.layout, self.rates, image, self.S)
+        lin = self._by_points(image, np.zeros(self.layout.size), self.S)
         straight.measured(sigmas, curved_share(image, lin, lin.valid))
-        return self._with_shared(image, lin)
+        return lin
+
+    def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
+        return self._with_shared(image, by_sigma_points(self.state, self.layout, self.rates, image, dx, S))
 
     def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> tuple[FloatArray, FloatArray]:
         """Take a correction by an image of a camera: square root of the covariance, and step of the state.
@@ -344,7 +349,10 @@ class CalibrationFilter:
             information -= known.T @ known
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
-        return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
+        score = self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
+        if fit.again:  # its derivatives do not have the error of the prediction
+            score[-1] = 0.0
+        return score
 
     def allowing_for_arm_bias(self) -> CalibrationFilter:
         """The filter with sigmas that include the uncertainty of the subtracted bias.

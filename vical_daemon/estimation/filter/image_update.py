@@ -1,8 +1,9 @@
-"""The linear algebra of one image's correction: gates and compression."""
+"""The linear algebra of one image's correction: gates, compression, and iteration while far from straight."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,9 +18,13 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 POSE_DOF = 6  # degrees of freedom of an image that its pose takes up
+_ITERATIONS = 5  # of the update, at most: each takes a digit or more off what is left
+_CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
 _CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of a corner before the update
 _RESIDUAL_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of what the update leaves of it
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
+
+Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
 
 
 @lru_cache(maxsize=256)
@@ -43,9 +48,10 @@ class ImageFit:
         left: Whitened residuals after the correction, shape (n, 2).
         ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
         r: Their innovation, shape (m,).
-        rows: Ways and innovation of the kept rows, whitened, (2n, k) and (2n,).
+        rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
         log_det: Logarithm of the determinant of the covariance of what the state can explain, whitened.
         noise: Of the kept corners over `Image.sigma_px`; by both all but `rest` and `left` is whitened.
+        again: The image was linearised again about the result.
     """
 
     S: FloatArray
@@ -61,6 +67,7 @@ class ImageFit:
     rows: tuple[FloatArray, FloatArray]
     log_det: float
     noise: float
+    again: bool = False
 
 
 def log_likelihood(fit: ImageFit | None, image: Image) -> float:
@@ -83,6 +90,13 @@ def log_likelihood(fit: ImageFit | None, image: Image) -> float:
 def rows_of(keep: BoolArray) -> BoolArray | slice:
     """The two rows of each point kept; a slice where that is all of them, which copies nothing."""
     return slice(None) if keep.all() else np.repeat(keep, 2)
+
+
+def whitened(image: Image, lin: Linear, fit: ImageFit) -> tuple[FloatArray, FloatArray]:
+    """The ways of the kept corners and their innovation over the corner noise, shapes (2n, k), (2n,)."""
+    sigma = image.sigma_px[fit.keep] * fit.noise
+    ways = lin.ways[rows_of(fit.keep)] / np.repeat(sigma, 2)[:, None]
+    return ways, ((image.uv - lin.z)[fit.keep] / sigma[:, None]).ravel()
 
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
@@ -122,6 +136,40 @@ def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
     return float(share[keep].max())
 
 
+def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, linearise: Linearise) -> ImageFit:
+    """Iterated posterior linearisation (once is enough when the prior is tight).
+
+    Args:
+        image: The points.
+        prior: Square root of the covariance, shape (c, c).
+        lin: The image linearised about the prior.
+        keep: Points that passed the gate, shape (n,).
+        linearise: Linearises again, about a step and with a spread.
+
+    Returns:
+        The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
+    """
+    S, dx = prior, np.zeros(len(prior))
+    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
+    for step in range(_ITERATIONS):
+        if step:
+            lin = linearise(dx, S)
+            if (keep & lin.valid).sum() < LEAST_POINTS:  # about this step most points are behind the camera
+                break
+            keep = keep & lin.valid
+            # the innovation refers to the prior mean
+            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
+        fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
+        fit.again = step > 0
+        if curved_share(image, lin, fit.keep) < _CURVED:
+            break
+        step_size = unscented.solve_lower(fit.S, fit.dx - dx)
+        S, dx, keep = fit.S, fit.dx, fit.keep
+        if step and float(np.linalg.norm(step_size)) < 0.05:
+            break
+    return fit
+
+
 def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     """Sum of squares and number of the rows that no state moves."""
     alone = np.vecdot(rows, rows) < _ALONE
@@ -130,23 +178,17 @@ def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     return float(left @ left), count
 
 
-def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray) -> ImageFit:
-    """One linear correction; corners whose residual stays impossible are dropped and it is done again.
-
-    Args:
-        image: The points.
-        prior: Square root of the covariance, shape (c, c).
-        lin: The image linearised about the prior.
-        keep: Points that passed the gate, shape (n,).
-    """
-    innovation = (image.uv - lin.z).ravel()
+def _correct(
+    prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
+) -> ImageFit:
+    """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
     weight, k = 1.0 / np.repeat(image.sigma_px, 2), lin.ways.shape[1]
     ways, r = lin.ways * weight[:, None], innovation * weight
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
         if float(np.vecdot(curved, curved).max(initial=0.0)) > 1e-4:
             ways = np.concatenate([ways, curved], axis=1)
-    moves = lin.moves
+    moves = np.concatenate([spread, lin.shared], axis=1) if lin.shared.size else spread
     known = moves.shape[1]
     for _ in range(3):
         rows = rows_of(keep)

@@ -178,13 +178,15 @@ def is_rolling(state: State, layout: Layout, camera: str) -> bool:
     return layout.cameras[camera].readout is not None or state.cameras[camera].readout_s != 0.0
 
 
-def by_sigma_points(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
-    """Statistical linearisation about the nominal state with spread S.
+def by_sigma_points(
+    state: State, layout: Layout, rates: Rates, image: Image, dx: FloatArray, S: FloatArray
+) -> Linear:
+    """Statistical linearisation about `dx` with spread S (all in the chart of the prior).
 
     Derivatives refer to the rows at which corners are expected: at the measured rows they would contain the
     noise of the corners, and pass for information. The mean refers to the measured rows.
     """
-    errors = unscented.offsets(S)
+    errors = dx + unscented.offsets(S)
     project = partial(project_errors, state, layout, rates, image.camera, image.t_cam_s, image.points)
     if is_rolling(state, layout, image.camera):
         pixels = project(project(None, errors[:1])[0], errors)
@@ -204,7 +206,7 @@ def by_sigma_points(state: State, layout: Layout, rates: Rates, image: Image, S:
 def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order about the nominal state, by differences; for rolling shutters."""
     steps = np.diag(_STEP * np.sqrt(np.vecdot(S, S)))
-    lin = by_sigma_points(state, layout, rates, image, steps)
+    lin = by_sigma_points(state, layout, rates, image, np.zeros(len(S)), steps)
     return replace(lin, spread=lin.by_error @ S, curved=np.zeros((len(lin.ways), 0)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vical_daemon.estimation.filter.image_update import ImageFit
+from vical_daemon.estimation.filter.image_update import ImageFit, whitened
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
@@ -23,17 +23,19 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
         fit: Its correction, not yet accepted.
     """
     where = f.layout.cameras[image.camera]
+    # a fit far from straight is linearised elsewhere
+    rows = whitened(image, lin, fit) if lin.curved.size else fit.rows
     if f.jumped is not None:
         f.jumped.correct(f.S, fit.S, fit.dx)
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)
     if shared is not None:
-        ways, innovation = fit.rows if lin.curved.size else (fit.ways, fit.r)
+        ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)
         level = f.consistency[image.camera].level
         by_shared = ways @ lin.by_shared
         shared.learn(image.t_cam_s, innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
     if where.intrinsics is not None and where.distortion is not None and agreement is not None:
         by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
-        _ask_lens(f, agreement, image.camera, lin, fit.rows, by_lens)
+        _ask_lens(f, agreement, image.camera, lin, rows, by_lens)
 
 
 def _ask_lens(

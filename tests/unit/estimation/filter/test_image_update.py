@@ -9,20 +9,28 @@ from vical_daemon.estimation.filter.linearise import Image, Linear
 POINTS, STATES = 6, 3
 
 
-def test_the_second_order_part_of_an_image_is_noise():
-    """A correction against the dense one, with what corners share to second order in their covariance."""
+def test_a_step_that_puts_the_points_behind_the_camera_is_not_linearised_about():
     rng = np.random.default_rng(1)
-    ways, e = rng.standard_normal((2 * POINTS, STATES)), rng.standard_normal(STATES)
-    bent, seen = 0.05 * rng.standard_normal((2 * POINTS, 1)), np.ones(POINTS, bool)
+    ways = rng.standard_normal((2 * POINTS, STATES))
+    e = rng.standard_normal(STATES)
     uv = (ways @ e).reshape(-1, 2)
     image = Image("cam0", 0, 0.0, np.arange(POINTS), np.zeros((POINTS, 3)), uv, np.full(POINTS, 0.01))
-    unit, none = np.eye(STATES), np.zeros((STATES, 0))
-    fit = solve(image, unit, Linear(np.zeros((POINTS, 2)), ways, unit, unit, bent, seen, none), seen)
+    all_seen, bent = np.ones(POINTS, bool), np.full((2 * POINTS, 1), 0.005)
+
+    def linear(valid):
+        z, none = np.zeros((POINTS, 2)), np.zeros((STATES, 0))
+        return Linear(z, ways, np.eye(STATES), np.eye(STATES), bent, valid, none)
+
+    asked = []
+
+    def behind(dx, S):
+        asked.append(dx)
+        return linear(np.zeros(POINTS, bool))
+
+    fit = solve(image, np.eye(STATES), linear(all_seen), all_seen, behind)
+    assert len(asked) == 1  # it was bent, so once more was tried
     assert fit.keep.all()
-    V = bent @ bent.T + (0.01 * fit.noise) ** 2 * np.eye(2 * POINTS)
-    P = np.linalg.inv(unit + ways.T @ np.linalg.solve(V, ways))
-    np.testing.assert_allclose(fit.S @ fit.S.T, P, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(fit.dx, P @ ways.T @ np.linalg.solve(V, uv.ravel()), rtol=1e-6)
+    np.testing.assert_allclose(fit.dx, e, atol=0.05)
 
 
 def test_a_blurred_image_is_known_from_a_moved_one():
@@ -54,7 +62,7 @@ def test_the_likelihood_of_an_image_counts_its_corner_noise():
     off = []
     for sigma in (0.1, 0.2, 2.0):
         image = Image("cam0", 0, 0.0, np.arange(POINTS), np.zeros((POINTS, 3)), uv, np.full(POINTS, sigma))
-        fit = solve(image, np.eye(STATES), lin, seen)
+        fit = solve(image, np.eye(STATES), lin, seen, lambda *_: lin)
         assert fit.keep.all()
         V = ways @ ways.T + (sigma * fit.noise) ** 2 * np.eye(2 * POINTS)
         expected = -0.5 * (uv.ravel() @ np.linalg.solve(V, uv.ravel()) + np.linalg.slogdet(V)[1])

@@ -85,7 +85,7 @@ def test_derivatives_of_the_view_are_those_of_the_projection(model):
 def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     state, layout, rates, image = scene("radtan")
     S = np.diag(np.full(layout.size, 1e-5))
-    points = by_sigma_points(state, layout, rates, image, S)
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_allclose(
         straight.ways @ straight.spread, points.ways @ points.spread, rtol=1e-4, atol=1e-7
@@ -138,7 +138,8 @@ def test_rows_of_a_rolling_shutter_put_no_noise_of_the_corners_into_derivatives(
     seen = project_errors(state, layout, rates, "cam0", image.t_cam_s, image.points, None, nominal[None])[0]
     noise = np.random.default_rng(3).standard_normal(seen.shape)
     clean, noisy = (
-        by_sigma_points(state, layout, rates, replace(image, uv=uv), S) for uv in (seen, seen + noise)
+        by_sigma_points(state, layout, rates, replace(image, uv=uv), nominal, S)
+        for uv in (seen, seen + noise)
     )
     np.testing.assert_array_equal(noisy.ways, clean.ways)
     np.testing.assert_array_equal(noisy.curved, clean.curved)
@@ -152,7 +153,7 @@ def test_points_behind_the_camera_are_invalid_either_way():
     state, layout, rates, image = scene("radtan")
     image.points[3] = state.p_world_imu - 2.0 * (image.points[3] - state.p_world_imu)
     S = np.diag(np.full(layout.size, 1e-5))
-    points = by_sigma_points(state, layout, rates, image, S)
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_array_equal(straight.valid, points.valid)
     assert not straight.valid[3]
@@ -169,7 +170,7 @@ def test_points_beside_the_camera_are_invalid_either_way():
     uv = view_derivatives(state, layout, rates, image)[0]
     beside = np.isfinite(uv).all(axis=1) & (np.abs(uv) > 1e5).any(axis=1)
     assert beside.any()
-    points = by_sigma_points(state, layout, rates, image, S)
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_array_equal(straight.valid, points.valid)
     assert straight.valid.any() and not straight.valid[beside].any()
