@@ -244,13 +244,13 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> tu
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
         attitude_sigmas(poses, lens),
-        TdIcpOptions(lost_s=np.inf),  # see below
+        TdIcpOptions(lost_s=np.inf),  # a start has its own limit
     )
     long = poses[-1].t_cam_s - poses[0].t_cam_s > LONG_S
     return found, found.reason or not_sure_yet(
         found.timeshift_sigma_s,
         float(np.max(found.rotation_sigma_rad)),
-        (8.0 if long else 1.0) * SHIFT_SIGMA_S,
+        _LONG_SHIFT_SIGMA_S if long else SHIFT_SIGMA_S,
         ROTATION_SIGMA_RAD,
     )
 
