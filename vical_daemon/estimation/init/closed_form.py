@@ -50,6 +50,7 @@ from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotatio
 from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
+_LONG_SHIFT_SIGMA_S = 8e-3  # of a start after a long time: slow rigs show no more [docs/design/filter.md]
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about
 
 
