@@ -1,7 +1,8 @@
 """Slow motion before a board: are lever arm along the optical axis and size of the board within their sigmas?
 
 Noise of the gyro biases it (see `lever_arm_score`). To remove chance, the error of the best estimate that the
-same noise allows, to first order, is subtracted. Without the correction that leaves -0.87 and -0.75 sigma.
+same noise allows, to first order, is subtracted. Without the correction that leaves -0.87 and -0.75 sigma,
+and with the images of the start corrected, too, although their motion fits them already, 0.32.
 """
 
 from dataclasses import replace
@@ -39,8 +40,8 @@ def beyond_chance(seed, rate_dps=RATE_DPS, **noise):
 def test_noise_of_the_gyro_does_not_bias_the_lever_arm(noise):
     """Nor where corners share an error: taken as independent, they leave 0.91 and 1.30."""
     added = [beyond_chance(seed, **noise) for seed in range(4)]
-    assert abs(np.mean(added)) < 0.35, added
-    assert np.sqrt(np.mean(np.square(added))) < 0.4, added
+    assert abs(np.mean(added)) < 0.2, added
+    assert np.max(np.abs(added)) < 0.45, added
 
 
 def test_starts_in_slow_motion_where_images_are_off_as_a_whole():

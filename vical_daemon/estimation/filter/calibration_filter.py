@@ -26,7 +26,7 @@ from vical_daemon.estimation.filter.image_update import (
     solve,
     whitened,
 )
-from vical_daemon.estimation.filter.jump_scores import Corrected, JumpSizes, Moved
+from vical_daemon.estimation.filter.jump_scores import JumpSizes
 from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
@@ -38,6 +38,7 @@ from vical_daemon.estimation.filter.linearise import (
     is_rolling,
     view_derivatives,
 )
+from vical_daemon.estimation.filter.passed import Corrected, Moved
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.reset import move
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
@@ -211,7 +212,7 @@ class CalibrationFilter:
         score = self._arm_score(image, lin, fit)
         self.arm_scores = self.arm_scores + score
         before = self.S
-        after, carried = self._accept(fit.S, fit.dx + self._step_by(score, fit.S), image.camera)
+        after, carried = self._accept(fit.S, self._unbiased(fit.dx, score, fit.S), image.camera)
         rows = whitened(image, lin, fit) if lin.curved.size else (fit.ways, fit.r)
         self.passed.append(Corrected(before, after, carried, *rows, lin.moves))
         noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
@@ -354,6 +355,10 @@ class CalibrationFilter:
             score[-1] = 0.0
         return score
 
+    def _unbiased(self, dx: FloatArray, score: FloatArray, S: FloatArray) -> FloatArray:
+        """A correction, shape (n,), without its bias by `_arm_score`."""
+        return np.asarray(dx + self._step_by(score, S))
+
     def allowing_for_arm_bias(self) -> CalibrationFilter:
         """The filter with sigmas that include the uncertainty of the subtracted bias.
 
@@ -454,9 +459,8 @@ class CalibrationFilter:
 
     def _drift(self, A: FloatArray, S: FloatArray, dt: float) -> None:
         """Let errors of time shifts in `A` drift for `dt` seconds by those of the rates in `S`."""
-        for where in self.layout.cameras.values():
-            if where.timeshift is not None and where.skew is not None:
-                A[where.timeshift] += dt * S[where.skew]
+        for shift, rate in self.layout.drifts:
+            A[shift] += dt * S[rate]
 
     def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
         """A filter that can run ahead of this one; both share the measured noise.

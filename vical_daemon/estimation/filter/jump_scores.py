@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
+from vical_daemon.estimation.filter.passed import Corrected, Moved, by_step, said
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import RIDGE, solve_lower, unit
 
@@ -36,42 +37,6 @@ def _likelihoods(A: FloatArray, b: FloatArray) -> FloatArray:
     scaled = b[..., None, :] * SIZES[:, None]
     explained = np.vecdot(scaled, np.linalg.solve(inner, scaled[..., None])[..., 0])
     return np.asarray(0.5 * (explained - np.linalg.slogdet(inner)[1]))
-
-
-class Moved(NamedTuple):
-    """How a filter was propagated.
-
-    Attributes:
-        before: Square root of the covariance before, shape (n, n).
-        after: Square root of the covariance afterwards, shape (n, n).
-        linear: F `before` of the motion by the dynamic errors, shape (9, d).
-        seconds: For how long.
-    """
-
-    before: FloatArray
-    after: FloatArray
-    linear: FloatArray
-    seconds: float
-
-
-class Corrected(NamedTuple):
-    """How a filter was corrected by an image.
-
-    Attributes:
-        before: Square root of the covariance as predicted, shape (n, n).
-        after: Likewise, of the corrected state, by the same errors.
-        carried: What its columns are as errors of the corrected state, see `Reset`, shape (n, n).
-        ways: The whitened corners by the ways in which the image can move, shape (m, w).
-        innovation: Theirs, shape (m,).
-        moves: Square root of how far the state, and then what corners share, move the image: (w, c).
-    """
-
-    before: FloatArray
-    after: FloatArray
-    carried: FloatArray
-    ways: FloatArray
-    innovation: FloatArray
-    moves: FloatArray
 
 
 class JumpScores(NamedTuple):
@@ -112,9 +77,9 @@ class JumpScores(NamedTuple):
                 after = done.carried if isinstance(done, Corrected) else done.after
                 if after is not root:  # an error was reopened, or errors mean something else now
                     A, b = _before(A, b, solve_lower(root, after))
-                A, b = _before(A, b, _by_step(done, drifts))
+                A, b = _before(A, b, by_step(done, drifts))
                 if isinstance(done, Corrected):
-                    J, j = _said(done)
+                    J, j = said(done)
                     spread = done.moves[:, :n]
                     A, b = A + spread.T @ J @ spread, b + j @ spread
                 root = done.before
@@ -135,26 +100,6 @@ class JumpScores(NamedTuple):
 def _before(A: FloatArray, b: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """What is said about the errors before a step, from what is said about those after it."""
     return step.T @ A @ step, b @ step
-
-
-def _by_step(done: Moved | Corrected, drifts: Sequence[tuple[int, int]]) -> FloatArray:
-    """Errors after a step by those before it, in columns of the roots, shape (n, n)."""
-    if isinstance(done, Corrected):
-        return np.asarray(solve_lower(done.before, done.after).T)  # 1 - K H = P+ P^-1
-    carried = done.before.copy()
-    carried[:9, : done.linear.shape[1]] = done.linear
-    for shift, rate in drifts:
-        carried[shift] += done.seconds * done.before[rate]
-    return solve_lower(done.after, carried)
-
-
-def _said(image: Corrected) -> tuple[FloatArray, FloatArray]:
-    """W' V^-1 W and W' V^-1 r, V = 1 + W moves moves' W', shapes (w, w) and (w,)."""
-    ways, moves = image.ways, image.moves
-    N = ways.T @ ways
-    weighted = np.concatenate([N, (ways.T @ image.innovation)[:, None]], axis=1)
-    inner = np.linalg.solve(unit(len(N)) + N @ (moves @ moves.T), weighted)
-    return inner[:, :-1], inner[:, -1]
 
 
 @dataclass(slots=True)

@@ -14,7 +14,9 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_update import ImageFit, corner_gate
 from vical_daemon.estimation.filter.linearise import Image, Linear, by_derivatives, by_small_steps, is_rolling
-from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives
+from vical_daemon.estimation.filter.passed import smoothed
+from vical_daemon.estimation.filter.propagate import move_by_derivatives
+from vical_daemon.estimation.filter.reset import displaced
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.rates import rates_after
@@ -40,17 +42,30 @@ class Instant(NamedTuple):
     v: FloatArray
 
 
-@dataclass(slots=True)
-class Derivatives:
-    """Those about one reference: a second filter about it has the same.
+class Reference(NamedTuple):
+    """Motion and calibration about which a filter is linearised.
 
     Attributes:
-        moved: Of the motion over segments, by their end (s).
-        views: Of images, by camera and stamp (ns).
+        calibration: A state; its motion does not count.
+        instants: The motion, in order; from each on inertial data carry it to the next.
     """
 
-    moved: dict[float, Propagated] = field(default_factory=dict)
-    views: dict[tuple[str, int], Linear] = field(default_factory=dict)
+    calibration: State
+    instants: list[Instant]
+
+
+class Seen(NamedTuple):
+    """What a filter knew when an image corrected it.
+
+    Attributes:
+        camera: Whose image it was.
+        reference: About which all is linearised, there.
+        offset: The mean before the image, as errors of the reference, shape (n,).
+    """
+
+    camera: str
+    reference: State
+    offset: FloatArray
 
 
 @dataclass(slots=True)
@@ -59,27 +74,25 @@ class LinearisedFilter(CalibrationFilter):
 
     Attributes:
         offset: The mean, as errors of `state`, shape (n,).
-        instants: Motion of the reference from here on, in order; between them inertial data carry it.
-        known: Derivatives about the reference, as far as they have been worked out.
+        instants: Motion of the reference from here on.
+        seen: The images so far.
+        at_reference: Pixels of the last image as the reference has them, shape (n, 2).
     """
 
     offset: FloatArray = field(default_factory=lambda: np.zeros(0))
     instants: list[Instant] = field(default_factory=list)
-    known: Derivatives = field(default_factory=Derivatives)
+    seen: list[Seen] = field(default_factory=list)
+    at_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @classmethod
-    def about(
-        cls, calibration: State, instants: list[Instant], known: CalibrationFilter, derivatives: Derivatives
-    ) -> LinearisedFilter:
+    def about(cls, reference: Reference, known: CalibrationFilter) -> LinearisedFilter:
         """What `known` knows, linearised about a reference.
 
         Args:
-            calibration: Of the reference; its motion does not count.
-            instants: Its motion; the filter begins at the first of them.
+            reference: The filter begins at the first of its instants.
             known: A filter with mean and covariance there; is used up.
-            derivatives: About this reference, as far as they are known.
         """
-        begin, *later = instants
+        calibration, (begin, *later) = reference
         cameras = {name: replace(camera) for name, camera in calibration.cameras.items()}
         state = replace(
             calibration,
@@ -91,7 +104,7 @@ class LinearisedFilter(CalibrationFilter):
         )
         fields_of = {x.name: getattr(known, x.name) for x in fields(known)} | {"state": state}
         offset = difference(known.state, state, known.layout)
-        return cls(**fields_of, offset=offset, instants=later, known=derivatives)
+        return cls(**fields_of, offset=offset, instants=later)
 
     @property
     def mean(self) -> State:
@@ -105,24 +118,36 @@ class LinearisedFilter(CalibrationFilter):
         out.step(self.offset)
         return out
 
+    def smoothed(self) -> Reference:
+        """The motion and calibration that fit all images so far and all readings, to first order.
+
+        Time shifts stay, so that images stay at their instants.
+        """
+        changes = smoothed(self.passed, self.layout.drifts)
+        errors = [seen.offset + change for seen, change in zip(self.seen, changes, strict=True)]
+        instants = []
+        for seen, e in zip(self.seen, errors, strict=True):
+            s = displaced(seen.reference, self.layout, e, seen.camera)
+            instants.append(Instant(s.t_s, s.R_world_imu, s.p_world_imu, s.v_world_imu))
+        calibration = errors[0].copy()
+        for shift, rate in self.layout.drifts:
+            calibration[[shift, rate]] = 0.0
+        return Reference(retract(self.seen[0].reference, self.layout, calibration), instants)
+
     def predict(self, segment: ImuSegment) -> None:
         """Propagate to the end of a segment; the reference goes on from its own instant where it has one."""
         state, d = self.state, self.layout.dynamic
         if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
             self.rates = rates_after(state, segment, self.rates)
             return
-        end_s = float(segment.t_s[-1])
-        if end_s not in self.known.moved:
-            self.known.moved[end_s] = move_by_derivatives(state, self.layout, np.eye(d), segment)
-        moved = self.known.moved[end_s]
+        moved = move_by_derivatives(state, self.layout, np.eye(d), segment)
         self.offset[:9] = moved.linear @ self.offset[:d]
-        for where in self.layout.cameras.values():
-            if where.timeshift is not None and where.skew is not None:
-                self.offset[where.timeshift] += moved.seconds * self.offset[where.skew]
+        for shift, rate in self.layout.drifts:
+            self.offset[shift] += moved.seconds * self.offset[rate]
         Q = moved.influence.noise(self.imu_noise)
         self._grow(moved._replace(linear=moved.linear @ self.S[:d, :d]), Q)
         self._predict_score(moved, Q)
-        state.t_s = end_s
+        state.t_s = float(segment.t_s[-1])
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         while self.instants and self.instants[0].t_s < state.t_s + _SAME_S:
             there = self.instants.pop(0)
@@ -140,33 +165,34 @@ class LinearisedFilter(CalibrationFilter):
 
     def _linearise(self, image: Image) -> Linear:
         """About the reference; the pixels are those of the mean."""
-        views, key = self.known.views, (image.camera, image.t_ns)
-        if key not in views:
-            rolling = is_rolling(self.state, self.layout, image.camera)
-            derive = by_small_steps if rolling else by_derivatives
-            views[key] = derive(self.state, self.layout, self.rates, image, self.S)
-        lin = views[key]
+        rolling = is_rolling(self.state, self.layout, image.camera)
+        derive = by_small_steps if rolling else by_derivatives
+        lin = derive(self.state, self.layout, self.rates, image, self.S)
+        self.at_reference = lin.z
         z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
         return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S))
 
     def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:  # noqa: ARG002
         """By the reference: it has been adjusted to all images, while the mean may have lost its way."""
-        return corner_gate(image, image.uv - self.known.views[image.camera, image.t_ns].z, lin)
+        return corner_gate(image, image.uv - self.at_reference, lin)
 
     def _misses_gate(self, fit: ImageFit) -> bool:  # noqa: ARG002
         """Corners have been compared with the reference; errors over a hole in the images are no news."""
         return False
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
-        """See `CalibrationFilter._arm_score`; about an adjusted motion the target's size has no bias.
-
-        The motion fits images and readings alike (total least squares).
-        """
+        """See `CalibrationFilter._arm_score`; the size of the target keeps no uncertainty of a bias."""
         score = CalibrationFilter._arm_score(self, image, lin, fit)
         score[-1] = 0.0
         return score
 
-    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
+    def _unbiased(self, dx: FloatArray, score: FloatArray, S: FloatArray) -> FloatArray:  # noqa: ARG002
+        """The correction as it is: the reference fits images and readings alike (total least squares)."""
+        return dx
+
+    def _accept(self, S: FloatArray, dx: FloatArray, camera: str) -> tuple[FloatArray, FloatArray]:
         """Move the mean; the reference stays."""
+        cameras = {name: replace(known) for name, known in self.state.cameras.items()}
+        self.seen.append(Seen(camera, replace(self.state, cameras=cameras), self.offset))
         self.S, self.offset = S, self.offset + dx
         return S, S

@@ -57,16 +57,14 @@ def move(
     """
     columns = [S] if jumps is None else [S, jumps]
     before = CameraMoves.of(state, layout, camera)
-    p_cam = state.p_world_imu + before.arm + before.by(dx)
     for where, T in _turns(state, layout, dx):
         unscented.turn_rows(S, where, T)  # turns the columns, too
         for X in columns[1:]:
             X[where] = T @ X[where]
         if where is ATTITUDE:
             before = before._replace(by_turn=before.by_turn @ np.linalg.inv(T))
-    moved = retract(state, layout, dx)
+    moved = displaced(state, layout, dx, camera)
     after = CameraMoves.of(moved, layout, camera)
-    moved.p_world_imu = p_cam - after.arm
     seen = before.by(S)
     more = seen - after.by(S)
     if (np.vecdot(more, more) <= _MOVED**2 * np.vecdot(seen, seen)).all():
@@ -76,6 +74,14 @@ def move(
     for X in columns:
         X[POSITION] += before.by(X) - after.by(X)
     return Reset(moved, unscented.lower_root(carried), S, carried)
+
+
+def displaced(state: State, layout: Layout, dx: FloatArray, camera: str) -> State:
+    """The state moved by errors, shape (n,), of which the position of a camera is linear."""
+    before, moved = CameraMoves.of(state, layout, camera), retract(state, layout, dx)
+    p_cam = state.p_world_imu + before.arm + before.by(dx)
+    moved.p_world_imu = p_cam - moved.R_world_imu @ moved.cameras[camera].p_imu_cam
+    return moved
 
 
 class CameraMoves(NamedTuple):

@@ -20,7 +20,7 @@ from scipy.linalg import cho_solve, cholesky
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_update import POSE_DOF
 from vical_daemon.estimation.filter.linearise import Image, by_small_steps, is_rolling, view_derivatives
-from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
+from vical_daemon.estimation.filter.linearised_filter import Instant, LinearisedFilter, Reference
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import LEAST_IMAGES
@@ -150,7 +150,6 @@ class BoardWindow:
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
         self.noise: list[float] = []
         self.shared: dict[str, FloatArray] = {}
-        self._derivatives = Derivatives()  # of the filters about the window, once it is solved
         self._measured: list[tuple[FloatArray, FloatArray, FloatArray | None]] = []  # by node, see `rates_at`
 
     @classmethod
@@ -223,16 +222,22 @@ class BoardWindow:
             now, images, damping = trial, beyond, 0.1 * damping if damping > 1e-9 else 0.0
         return None
 
-    def filter(self, prior: CalibrationFilter) -> LinearisedFilter:
+    def filter(self, prior: CalibrationFilter, reference: Reference | None = None) -> LinearisedFilter:
         """A filter that knows what `prior` knows, linearised about the window; `prior` is used up.
 
-        The window's own motion is the mean of the prior of the motion, which is wide enough for that.
+        The reference's own motion is the mean of the prior of the motion, which is wide enough for that.
+
+        Args:
+            prior: See above.
+            reference: About which it is linearised; None: motion and calibration of the window.
         """
-        t_s, R, p, v = self.nodes[0].at
+        if reference is None:
+            reference = Reference(self.state, [n.at for n in self.nodes])
+        t_s, R, p, v = reference.instants[0]
         prior.state = replace(prior.state, t_s=t_s, R_world_imu=R, p_world_imu=p, v_world_imu=v)
         for name, noise in prior.corner_noise.items():
             noise.sigma_px = noise.guess_px = self.sigma_px[name]
-        return LinearisedFilter.about(self.state, [n.at for n in self.nodes], prior, self._derivatives)
+        return LinearisedFilter.about(reference, prior)
 
     # ------------------------------------------------------------------ values
     def at(self, node: Node, camera: str) -> State:

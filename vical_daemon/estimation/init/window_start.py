@@ -90,7 +90,7 @@ def window_start(
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():
         return None
-    out = window.filter(make(deepcopy(state)))
+    out = window.filter(make(deepcopy(state)), trial.smoothed())
     out.corner_noise, out.shared, out.consistency = trial.corner_noise, trial.shared, trial.consistency
     for consistency in out.consistency.values():
         consistency.settle()

@@ -99,6 +99,12 @@ class Layout:
         (only,) = self.cameras.values()
         return only
 
+    @property
+    def drifts(self) -> list[tuple[int, int]]:
+        """Where errors of time shifts and of their rates are."""
+        cameras = self.cameras.values()
+        return [(c.timeshift, c.skew) for c in cameras if c.timeshift is not None and c.skew is not None]
+
     def lens(self, camera: str) -> slice:
         """Where fx fy cx cy and the distortion of a lens lie, which must be among the errors."""
         where = self.cameras[camera]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.jump_scores import Corrected, Moved
+from vical_daemon.estimation.filter.passed import Corrected, Moved
 from vical_daemon.estimation.filter.sensor_intake import SEARCHED_S
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, poses_of

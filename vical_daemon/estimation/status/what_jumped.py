@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from enum import Enum, auto
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -86,10 +87,11 @@ _NOT_BESIDE = (
 """Parts that are not considered where one of others is possible, in this order."""
 
 
-def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
+def _jumps(layout: Layout, state: State, camera: str, until_s: float) -> dict[Part, FloatArray]:
     """Parts that may jump: directions of the errors, each as long as one sigma of the jump, shape (n, q).
 
-    Those of a knock are the time shift's and, next to them, the mounting's.
+    Those of a knock are the time shift's and, next to them, the mounting's. Biases may jump at any time until
+    the next image, at `until_s` in the imu's clock: the rest of that time they have moved the rig too far.
     """
     out = {}
     where, every = layout.cameras[camera], range(layout.size)
@@ -113,10 +115,10 @@ def _jumps(layout: Layout, state: State, camera: str) -> dict[Part, FloatArray]:
         errors = [k for own in mountings.values() for k in own]
         out[Part.MOUNTINGS] = _columns(layout.size, errors, np.tile(sigmas, len(mountings)))
         out[Part.IMU] = _imu_moves(state, layout)
-    biases = [*every[GYRO_BIAS], *every[ACCEL_BIAS]]
-    out[Part.BIASES] = _columns(
-        layout.size, biases, np.repeat([GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2], 3)
-    )
+    biases = [*every[GYRO_BIAS], *every[ACCEL_BIAS], *every[ATTITUDE], *every[VELOCITY]]
+    sigmas = np.repeat([GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2], 3)
+    too_far = (until_s - state.t_s) / math.sqrt(3.0) * sigmas  # RMS over all times
+    out[Part.BIASES] = _columns(layout.size, biases, np.concatenate([sigmas, too_far]))
     out[Part.TARGET] = _target_moves(state, layout.size)
     return out
 
@@ -291,7 +293,9 @@ def _follow_after(
     Returns:
         None where it is less.
     """
-    f, jumps = deepcopy(before), _jumps(before.layout, before.state, camera)
+    f, (t_cam_s, frame) = deepcopy(before), images[0]
+    next_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
+    jumps = _jumps(f.layout, f.state, camera, next_s)
     if Part.KNOCK in parts:
         jumps[Part.KNOCK] = np.concatenate([jumps[Part.SHIFT], jumps[Part.MOUNTING]], axis=1)
     columns = np.concatenate([jumps[part] * size for part, size in parts.items()], axis=1)
@@ -334,15 +338,10 @@ def _suspects(
         Each part, and an image just before which it may have jumped, the likeliest first; nothing where no
         jump is likely.
     """
-    states, layout = [before.state, *(x.state for x in taken[:-1])], before.layout
-    jumps = [_jumps(layout, state, camera) for state in states]
+    states, layout = [before.state, *(x.state for x in taken)], before.layout
+    jumps = [_jumps(layout, state, camera, after.t_s) for state, after in pairwise(states)]
     columns = [np.concatenate(list(x.values()), axis=1) for x in jumps]
-    drifts = [
-        (c.timeshift, c.skew)
-        for c in layout.cameras.values()
-        if c.timeshift is not None and c.skew is not None
-    ]
-    scores = JumpScores.of([x.passed for x in taken], columns, drifts)
+    scores = JumpScores.of([x.passed for x in taken], columns, layout.drifts)
     ends = np.cumsum([x.shape[1] for x in jumps[0].values()])
     own = {part: slice(end - x.shape[1], end) for (part, x), end in zip(jumps[0].items(), ends, strict=True)}
     if Part.SHIFT in own and Part.MOUNTING in own:

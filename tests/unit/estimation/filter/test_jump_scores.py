@@ -7,7 +7,8 @@ from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prio
 from vical_mocks.points import simulate
 from vical_mocks.rig import Bump, reference_rig
 
-from vical_daemon.estimation.filter.jump_scores import SIZES, Corrected, JumpScores, JumpSizes, Moved
+from vical_daemon.estimation.filter.jump_scores import SIZES, JumpScores, JumpSizes
+from vical_daemon.estimation.filter.passed import Corrected, Moved
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.unscented import solve_lower
 

@@ -18,7 +18,7 @@ from vical_mocks.points import simulate
 
 from benchmarks import zoo
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.filter.linearised_filter import Derivatives, LinearisedFilter
+from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter, Reference
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init import initializer
 from vical_daemon.estimation.init.window_start import window_start
@@ -149,7 +149,7 @@ def test_a_filter_about_another_reference_ends_at_the_same_place(given):
     for reference in (found.state, elsewhere):
         prior = make(state)
         prior.state, prior.S = known.state, known.S.copy()
-        f = LinearisedFilter.about(reference, instants, prior, Derivatives())
+        f = LinearisedFilter.about(Reference(reference, instants), prior)
         for t_s, frame in frames:
             step(f, frame, t_s)
         ends.append(f.plain())

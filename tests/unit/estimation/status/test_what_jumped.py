@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.unit.estimation.some_filter import NAME, some_filter
-from vical_daemon.estimation.filter.jump_scores import Corrected, JumpSizes
+from vical_daemon.estimation.filter.jump_scores import JumpSizes
+from vical_daemon.estimation.filter.passed import Corrected
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.status import what_jumped as module
 from vical_daemon.estimation.status.recent_past import Taken
