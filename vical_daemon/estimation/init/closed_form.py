@@ -41,7 +41,7 @@ from vical_daemon.estimation.measurements import (
     Frames,
     PointsFrame,
 )
-from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
+from vical_daemon.estimation.model.priors import LONG_SHIFT_SIGMA_S, ROTATION_SIGMA_RAD, SHIFT_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.significance import SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.td_icp import DOUBTFUL_RAD, td_icp
@@ -50,7 +50,6 @@ from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotatio
 from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 PARTIAL_S = 6.0  # before, a second axis may come yet
-_LONG_SHIFT_SIGMA_S = 8e-3  # of a start after a long time: slow rigs show no more [docs/design/filter.md]
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)  # time shifts searched about the one axis that the rig has turned about
 
 
@@ -251,7 +250,7 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> tu
     return found, found.reason or not_sure_yet(
         found.timeshift_sigma_s,
         float(np.max(found.rotation_sigma_rad)),
-        _LONG_SHIFT_SIGMA_S if long else SHIFT_SIGMA_S,
+        LONG_SHIFT_SIGMA_S if long else SHIFT_SIGMA_S,
         ROTATION_SIGMA_RAD,
     )
 

@@ -73,6 +73,8 @@ class StartSigmas(NamedTuple):
 
 ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = math.radians(1.0), 1e-3
 """So well mounting and time shift must be known for a start: 0.06 deg at 60 deg/s. [docs/design/filter.md]"""
+LONG_SHIFT_SIGMA_S = 8e-3
+"""Likewise of a start after a long time: slow rigs show no more. [docs/design/filter.md]"""
 AGAIN_SIGMAS = 5.0
 """Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
 FILTER_START = StartSigmas(0.1, 0.5, 0.3, 0.1, 0.05, 0.05, 0.05, 0.1, 0.1, 0.1, 0.01)

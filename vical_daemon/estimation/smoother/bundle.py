@@ -14,7 +14,6 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
@@ -25,7 +24,7 @@ from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left, moves
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
 from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
-from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
+from vical_daemon.estimation.smoother.window import Seen, Window
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 _OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
@@ -37,6 +36,7 @@ _BOUNDS = 0.2, 5.0  # of an inverse distance after a step, over that before it
 _ROUNDS = 4  # of looking for distances that a step would move beyond their bounds
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
+_LESS = 1.1  # of the noise of features, over what is measured at the end: then a window goes on
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
 """What a step changes of a window."""
 _MEMORY = 25  # images over which an error of the pixels may last
@@ -139,6 +139,13 @@ class Bundle:
             step = None if now is None else self._step(now.normal, now.damping, _ROUNDS if now.cleaned else 1)
             if now is None or step is None:
                 return None
+            if now.cleaned and now.damping > _DAMPING and step.predicted_reduction < DONE:
+                bare = self._step(now.normal, _DAMPING, _ROUNDS)  # with damping, little is predicted
+                if bare is not None and bare.predicted_reduction >= DONE:
+                    self._tried(now, step)
+                    now = self._relinearised(now, buffer)
+                    continue
+                step = bare or step
             if step.predicted_reduction >= (DONE if now.cleaned else _SMALL * now.normal.cost):
                 if not self._tried(now, step) or not w.stale():
                     continue
@@ -148,16 +155,13 @@ class Bundle:
                 if self._refuse(now.view):
                     now.view = self.problem.view(w.observe())
                 now.cleaned = True
-            elif now.damping > _DAMPING:  # with damping, little is predicted
-                now.relax()
-                continue
             else:
-                now.view = self._applied(step, now.view.seen)
-                if not self._suspects_offsets(now):
+                self._tried(now, step)
+                if not self._fits_better(now.view) and not self._suspects_offsets(now):
                     fit = self._result(now, step.root, steps, settled=True)
                     if fit is None or 2 * steps > most or not self._shows_more(fit):
                         return fit
-                w.bad.clear()  # late images had looked like outliers
+                w.bad.clear()  # late images, and a window that was still far off, had looked like outliers
                 now.view, now.cleaned = self.problem.view(w.observe()), False
             now = self._relinearised(now, buffer)
         return None if now is None else self._result(now, None, most, settled=False)
@@ -303,20 +307,21 @@ class Bundle:
         """Take a step; what the window then says of the observations."""
         dx, dl = step.states, step.landmarks
         w, order = self.window, self.problem.order()
-        d = dx[order.frames]
-        w.R = orthonormal(w.R @ so3.exp(d[:, :3]))
-        w.p, w.v = w.p + d[:, 3:6], w.v + d[:, 6:]
-        w.bias = w.bias + dx[order.knots]
+        d, R, arm = dx[order.frames], w.R, w.camera.p_imu_cam
         layout = self.carry.layout
         full = np.concatenate([np.zeros(layout.core), dx[order.constants]])
         w.camera, w.imu = moved_camera(w.camera, layout.camera, full), w.imu + full[layout.inertial]
-        w.jumps = w.jumps + dx[order.jumps]
+        now = w.camera.p_imu_cam
+        w.R, w.v = orthonormal(R @ so3.exp(d[:, :3])), w.v + d[:, 6:]
+        # cameras move to first order: the product of a turn and a change of the lever arm would displace them
+        moved = d[:, 3:6] + np.matvec(R, now - arm + np.cross(d[:, :3], arm))
+        w.p = w.p + np.matvec(R, arm) + moved - np.matvec(w.R, now)
+        w.bias, w.jumps = w.bias + dx[order.knots], w.jumps + dx[order.jumps]
         if self.problem.own:
             w.own_lens = w.own_lens + dx[order.own]
-        m = w.landmarks
-        bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
-        bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-        w.landmarks = Landmarks(m.ids, m.anchor, bearing, m.inverse + dl[:, 2])
+        inverse = w.landmarks.inverse
+        marks = w.landmarks = w.landmarks.moved(dl, moved[seen.frame[seen.begin]])
+        np.clip(marks.inverse, _BOUNDS[0] * inverse, _BOUNDS[1] * inverse + 10.0 * _FAR, out=marks.inverse)
         return self.problem.view(seen)
 
     # ------------------------------------------------------------------ noise, outliers, result
@@ -346,6 +351,20 @@ class Bundle:
         sigma_px = float(np.clip(noise.sigma_px * np.median(size) / MEDIAN_RAYLEIGH / share, 0.02, 20.0))
         spread = float(np.sqrt(correlation(e, seen)))
         self.problem.noise = noise._replace(sigma_px=sigma_px, spread=spread)
+
+    def _fits_better(self, view: View) -> bool:
+        """Whether errors are smaller than when their noise was measured; then the new one counts.
+
+        That was before the last steps: along a valley a window may have been far from its answer then, and
+        with too much noise it stops before it is there.
+        """
+        before = self.problem.noise
+        self._learn_noise(view)
+        now = self.problem.noise
+        if before.sigma_px * before.spread > _LESS * now.sigma_px * now.spread:
+            return True
+        self.problem.noise = before
+        return False
 
     def _dof(self, seen: Seen) -> int:
         return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)

@@ -22,7 +22,12 @@ from vical_daemon.estimation.measurements import (
     Frames,
 )
 from vical_daemon.estimation.model import imu_scale
-from vical_daemon.estimation.model.priors import ROTATION_SIGMA_RAD, SHIFT_SIGMA_S, WINDOW_START
+from vical_daemon.estimation.model.priors import (
+    LONG_SHIFT_SIGMA_S,
+    ROTATION_SIGMA_RAD,
+    SHIFT_SIGMA_S,
+    WINDOW_START,
+)
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.track_start import (
@@ -205,8 +210,10 @@ class TargetFreeInitializer:
         about = None
         worst = float(np.sqrt(np.max(np.diag(best.rotation_covariance))))
         most = _ROTATION_SIGMA_RAD if given is None else np.inf
-        why = not_sure_yet(best.timeshift_sigma_s, worst, SHIFT_SIGMA_S, most)
-        if why and frames[-1][0] - frames[0][0] > PARTIAL_S:
+        long = frames[-1][0] - frames[0][0] > PARTIAL_S
+        limit_s = LONG_SHIFT_SIGMA_S if long else SHIFT_SIGMA_S
+        why = not_sure_yet(best.timeshift_sigma_s, worst, limit_s, most)
+        if why and long:
             inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
             about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
         if why and about is None:

@@ -1,8 +1,8 @@
 """A stretch of images without a target: motion at each image, landmarks, and who saw what.
 
-A landmark is kept as a bearing and an inverse distance from a fixed point of the world, so that far points
+A landmark is kept as a bearing and an inverse distance from a point of the world, so that far points
 are no special case: X = c + m / rho. [Civera et al., "Inverse depth parametrization for monocular SLAM",
-2008, with a fixed anchor instead of one that is estimated]
+2008, with an anchor that is no unknown: a step takes it along with the camera that saw the point first]
 """
 
 from __future__ import annotations
@@ -77,6 +77,23 @@ class Landmarks:
     def none(cls) -> Landmarks:
         """No points."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+    def moved(self, step: FloatArray, along: FloatArray) -> Landmarks:
+        """After a step of an adjustment, to first order; anchors go with the cameras that saw them first.
+
+        Were anchors to stay, all landmarks would move against them when the lever arm moves all cameras: by
+        centimetres in slow motion, and a bearing over an inverse distance is not linear then.
+
+        Args:
+            step: Of two tangents of the bearing and the inverse distance if anchors stay, shape (L, 3).
+            along: How the anchors move, m, shape (L, 3).
+        """
+        m, inverse = self.bearing, self.inverse
+        ahead = np.vecdot(m, along)
+        bearing = m + np.matmul(so3.tangents(m), step[:, :2, None])[..., 0]
+        bearing -= inverse[:, None] * (along - ahead[:, None] * m)
+        bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+        return Landmarks(self.ids, self.anchor + along, bearing, inverse + step[:, 2] + inverse**2 * ahead)
 
 
 @dataclass(slots=True)
