@@ -157,11 +157,13 @@ class Bundle:
                 now.cleaned = True
             else:
                 self._tried(now, step)
-                if not self._fits_better(now.view) and not self._suspects_offsets(now):
+                if self._suspects_offsets(now):
+                    w.bad.clear()  # late images had looked like outliers
+                elif not self._fits_better(now.view):
                     fit = self._result(now, step.root, steps, settled=True)
                     if fit is None or 2 * steps > most or not self._shows_more(fit):
                         return fit
-                w.bad.clear()  # late images, and a window that was still far off, had looked like outliers
+                    w.bad.clear()
                 now.view, now.cleaned = self.problem.view(w.observe()), False
             now = self._relinearised(now, buffer)
         return None if now is None else self._result(now, None, most, settled=False)
