@@ -18,6 +18,7 @@ from vical_daemon.estimation.result import NEARLY, CalibrationEstimate, Status
 SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
 images and inertial readings arrive shows the greater part."""
+_SHIFT = 6  # place of the time shift in `CameraEstimate.calibration_covariance`
 _FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
 _SINKS = 1e-3  # share of the difference by which the largest lead sinks at each image with a smaller one
 _AGREE = 5  # images in a row that show the same step
@@ -138,8 +139,17 @@ class SensorIntake:
         cameras = {}
         for name, camera in estimate.cameras.items():
             shift_s, sigma_s = camera.timeshift_cam_imu_s + self.offset_s(name), camera.timeshift_sigma_s
-            sigma_s = math.hypot(sigma_s, stamp_sigma_s) if sigma_s else 0.0
-            cameras[name] = replace(camera, timeshift_cam_imu_s=shift_s, timeshift_sigma_s=sigma_s)
+            joint = [row.copy() for row in camera.calibration_covariance]
+            if sigma_s:
+                sigma_s = math.hypot(sigma_s, stamp_sigma_s)
+                if joint:
+                    joint[_SHIFT][_SHIFT] += stamp_sigma_s**2
+            cameras[name] = replace(
+                camera,
+                timeshift_cam_imu_s=shift_s,
+                timeshift_sigma_s=sigma_s,
+                calibration_covariance=joint,
+            )
         return replace(estimate, cameras=cameras)
 
 

@@ -357,8 +357,7 @@ class Bundle:
     def _fits_better(self, view: View) -> bool:
         """Whether errors are smaller than when their noise was measured; then the new one counts.
 
-        That was before the last steps: along a valley a window may have been far from its answer then, and
-        with too much noise it stops before it is there.
+        Along a valley a window may have been far off then, and with too much noise it stops before its end.
         """
         before = self.problem.noise
         self._learn_noise(view)

@@ -176,7 +176,8 @@ def test_a_clock_that_is_set_forwards_is_no_gap(step_s):
 )
 def test_nothing_has_converged_while_the_stamps_are_known_worse(shift_sigma_s, stamp_sigma_s, status):
     pose = PoseEstimate([0.0] * 3, [1.0, 0.0, 0.0, 0.0], np.eye(6).tolist())
-    camera = CameraEstimate(pose, 0.0, shift_sigma_s, [], [], "", [], [], 0.0)
+    joint = np.diag([1.0] * 6 + [shift_sigma_s**2] + [1.0] * 8).tolist()
+    camera = CameraEstimate(pose, 0.0, shift_sigma_s, [], [], "", [], [], 0.0, calibration_covariance=joint)
     known = CalibrationEstimate(
         1, Status.CONVERGED, "", 1.0, "", 30.0, 300, 3000, {"cam0": camera}, None, [], 1.0, 0.0
     )
@@ -184,5 +185,9 @@ def test_nothing_has_converged_while_the_stamps_are_known_worse(shift_sigma_s, s
     assert intake.stamps_known_to(stamp_sigma_s)
     shown = intake.by_present_stamps(known, limit_s=5e-4)
     assert shown.status is status
+    shown_s = shown.cameras["cam0"].timeshift_sigma_s
+    assert shown_s == pytest.approx(np.hypot(shift_sigma_s, stamp_sigma_s) if shift_sigma_s else 0.0)
+    covariance = np.array(shown.cameras["cam0"].calibration_covariance)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [1.0] * 6 + [shown_s] + [1.0] * 8)
     assert (shown.progress == 1.0) == (status is Status.CONVERGED)  # "converging 100 %" puzzles
     assert ("known to 5.4 ms" in shown.reason) == (status is Status.CONVERGING)
