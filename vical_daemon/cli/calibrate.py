@@ -49,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "inputs",
         metavar="INPUT",
         nargs="+",
-        help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several recordings of one rig make one calibration",
+        help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with video and IMU table; several recordings "
+        "of one rig make one calibration",
     )
     add_sensors(parser)
     parser.add_argument(
@@ -159,6 +160,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         gravity_mps2=args.gravity,
     )
     add_recordings(job, recordings[1:], args.imu)
+    job.warn = warn
     job.common_clock = args.clock == CLOCKS[0]
     return job, accepted
 

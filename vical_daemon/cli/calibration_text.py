@@ -67,6 +67,12 @@ def _headline(result: dict[str, Any]) -> str:
     )
 
 
+def _own_clock_lines(camera: dict[str, Any]) -> list[str]:
+    """Say from what a time shift counts where the stamps of a video were moved first."""
+    added_s = camera.get("added_to_stamps_s")
+    return [] if added_s is None else [f"  {'':<22}t_cam = time in the video + {added_s:.3f} s"]
+
+
 def _camera_lines(camera: dict[str, Any]) -> list[str]:
     pose = camera["T_imu_cam"]
     sigma = [math.sqrt(max(row[i], 0.0)) for i, row in enumerate(pose["covariance"])]
@@ -79,6 +85,7 @@ def _camera_lines(camera: dict[str, Any]) -> list[str]:
         _row("sigma about cam x y z", [math.degrees(s) for s in sigma[3:]], None, "deg", 4),
         _row("time shift", [shift_ms], [1e3 * camera["timeshift_sigma_s"]], "ms", 3)
         + "  (t_imu = t_cam + shift)",
+        *_own_clock_lines(camera),
         *_readout_lines(camera),
         _row("fx fy cx cy", camera["intrinsics"], camera["intrinsics_sigma"], "px", 2),
         _row(camera["distortion_model"], camera["distortion"], camera["distortion_sigma"], "", 5),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import ProgressBar, finite
 from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named, warn
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
@@ -37,7 +37,11 @@ exit code: 0 holds; 4 no longer holds; 5 this recording cannot tell; 1 it cannot
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the recording, the calibration, and what counts as a change."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with video and IMU table",
+    )
     parser.add_argument(
         "--against",
         metavar="SOURCE",
@@ -91,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
     from vical_daemon.offline.calibration_job import make_job
     from vical_daemon.offline.camera_names import by_recording
     from vical_daemon.offline.sources import read_known
+    from vical_daemon.results.known import ANY_SHIFT_S
 
     known, rig = read_known(args.against)
     if rig is not None and rig.status == "inconsistent":
@@ -101,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
         load_target(Path(args.target))
     recording = open_recording(args.input, cameras=named(args.camera), imus=named(args.imu))
     for warning in recording.warnings:
-        print(f"vical: warning: {warning}", file=sys.stderr)
+        warn(warning)
     topics = {name: camera.topic for name, camera in known.items()}
     known = by_recording(known, topics, recording.cameras)
     initial = _initial(args, known, rig)
@@ -116,11 +121,18 @@ def run(args: argparse.Namespace) -> int:
         skip_s=args.skip,
         seconds=args.seconds,
     )
+    own_clock = bool(recording.unplaced)
+    if own_clock:
+        known = {name: camera.with_any_shift() for name, camera in known.items()}
+        counts = replace(counts, timeshift_s=10.0 * ANY_SHIFT_S)
+    job.warn = warn
     verifier = _verifier(known, list(job.cameras), held, counts, args.against)
     bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
     run_job(job, bar.show, enough=verifier.look)
     bar.close()
     document = verifier.document()
+    for camera in document["cameras"].values() if own_clock else ():
+        camera["blocks"].pop("time shift", None)
     paired = len(known) == 1 or args.camera  # then it is meant
     document["not_checked"] = [] if paired else [name for name in known if name not in verifier.cameras]
     if args.json:

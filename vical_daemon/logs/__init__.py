@@ -16,12 +16,13 @@ from vical_daemon.config.strict_yaml import MAX_BYTES
 from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.asl_tables import is_table
+from vical_daemon.logs.asl_video import VIDEO_SUFFIXES
 from vical_daemon.logs.bags import BagRecording, is_bag
 from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
-from vical_daemon.logs.what_is_there import FROM_VIDEO, VIDEOS, what_is_there
+from vical_daemon.logs.what_is_there import FROM_VIDEO, UNREAD_VIDEOS, what_is_there
 
 __all__ = [
     "LEFT_OUT",
@@ -30,6 +31,7 @@ __all__ = [
     "Recording",
     "RecordingError",
     "Stream",
+    "check_camera",
     "check_recording",
     "mcap_files",
     "meant",
@@ -112,7 +114,11 @@ def check_recording(
 
     fit = _fit(recording, recording.imus, imus, imu)
     readings = list(fit.values())
-    shown = _fit(recording, recording.cameras, cameras, lambda stream: check_camera(stream, readings))
+
+    def camera(stream: Stream) -> list[str]:
+        return check_camera(stream, [] if stream.name in recording.unplaced else readings)
+
+    shown = _fit(recording, recording.cameras, cameras, camera)
     of_cameras = [s for s in recording.streams if s.kind != "imu" and s.name in shown]
     for other in of_cameras:
         stream = shown[other.name]
@@ -219,8 +225,10 @@ def _why_not(path: Path) -> str:
     """Say why a file is no recording, and what to do."""
     if not path.is_file():
         return "is a pipe or a device: a recording is read more than once, copy it into a file"
-    if path.suffix.lower() in VIDEOS:
-        return f"is no recording: {FROM_VIDEO}, with imu0.csv next to it"
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return "is a video: give the folder that holds it and a table of the IMU's readings (imu0.csv)"
+    if path.suffix.lower() in UNREAD_VIDEOS:
+        return f"is a video {FROM_VIDEO}"
     if path.suffix.lower() in (".yaml", ".yml"):
         return "is no recording: give a target with --target, Kalibr's camchain or imu.yaml with --initial"
     if path.suffix in _UNPACKERS:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from vical_drivers.user_files import read_file
 
 from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encode_points
-from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
+from vical_daemon.bus.topics import COMPRESSED, IMAGE, IMU, POINTS, TRACKS, TopicError
 from vical_daemon.estimation.inertial.units import ImuArrays
 from vical_daemon.estimation.measurements import IntArray
 from vical_daemon.logs.asl_images import IMAGE_SUFFIXES, Images, image_list, image_size, images_by_name
@@ -26,6 +26,7 @@ from vical_daemon.logs.asl_tables import (
     read_table,
     without_cut_line,
 )
+from vical_daemon.logs.asl_video import read_video, videos_in
 from vical_daemon.logs.checks import take_turns
 from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
@@ -42,7 +43,7 @@ from vical_daemon.logs.table_text import FIRST_ROW, titles
 from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
 from vical_daemon.logs.two_tables import SensorTable, one_table, two_sensors
 from vical_daemon.logs.united_imu import forces_at
-from vical_daemon.logs.what_is_there import images_in, what_is_there
+from vical_daemon.logs.what_is_there import images_in, unread_videos_in, what_is_there
 
 RIG = "rig0"
 _CAMERAS = ("cam*", "image_[0-9]*")  # KITTI has image_00 to image_03
@@ -104,6 +105,8 @@ class AslRecording(Recording):
         self.warnings = []
         self.stamp_sigma_s = {}
         self.set_back_s = {}
+        self.added_ns: dict[str, int] = {}
+        self.unplaced: set[str] = set()
         self._as_recorded = as_recorded
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
@@ -122,6 +125,8 @@ class AslRecording(Recording):
             source = self._read_camera(camera)
             if source is not None:
                 self._sources.append(source)
+        if root.is_dir() and self.imu_tables:
+            self._read_videos(root, names, cameras)
         self.streams = tuple(source.stream for source in self._sources)
         if not self.streams and names is not None and imus:
             raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
@@ -129,9 +134,14 @@ class AslRecording(Recording):
             raise RecordingError(
                 f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
                 "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz], or "
-                f"Kalibr's imu0.csv and cam0/ with images named by their stamps, ns{what_is_there(root)}"
+                "Kalibr's imu0.csv and cam0/ with images named by their stamps, ns, or imu0.csv and a video"
+                f"{what_is_there(root)}"
             )
-        if not folders and names is None and (found := images_in(root)):
+        if (
+            not (folders or self.cameras)
+            and names is None
+            and (found := images_in(root) or unread_videos_in(root))
+        ):
             self.warnings.append(f"no cameras: their folders must be cam0, cam1 ...; found {found}")
 
     def imu_arrays(self, name: str) -> ImuArrays:
@@ -275,6 +285,47 @@ class AslRecording(Recording):
             t_ns = self._even_images("compressed", folder.name, t_ns, build)
         return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
 
+    def _read_videos(self, root: Path, names: Collection[str] | None, cameras: Collection[str]) -> None:
+        taken = {s.stream.name for s in self._sources if s.stream.kind != "imu"}
+        videos, warnings = videos_in(root, taken)
+        self.warnings.extend(warnings)
+        for name in [name for name in videos if name in cameras] or videos:
+            if names is None or name in names:
+                self._sources.append(self._read_video(videos[name], name))
+
+    def _read_video(self, path: Path, name: str) -> _Source:
+        video = read_video(path, name)
+        self.warnings.extend(f"{name}: {text}" for text in video.warnings)
+        self._note_stamps(name, video.column.sigma_s, video.column.report)
+        t_ns = video.column.t_ns
+
+        def build(i: int) -> bytes:
+            return video.build(i, int(t_ns[i]))
+
+        t_ns = self._even_images("image", name, t_ns, build)
+        if video.own_clock:
+            if self._as_recorded:
+                self.warnings.append(
+                    f"{name}: {path.name} has a clock of its own, taken to begin with the IMU's"
+                )
+            imu_ns = [s.stream.begin_ns for s in self._sources if s.stream.kind == "imu"]
+            self.added_ns[name] = min(imu_ns, default=0) - int(t_ns[0])
+            self.unplaced.add(name)
+            t_ns += self.added_ns[name]
+        return _Source(replace(self._stream("image", name, path, t_ns), resolution=video.size), t_ns, build)
+
+    def place(self, camera: str, by_ns: int) -> None:
+        """See `Recording.place`."""
+        self.unplaced.remove(camera)
+        self.added_ns[camera] += by_ns
+        for k, source in enumerate(self._sources):
+            if source.stream.name == camera:
+                t_ns = source.t_ns
+                t_ns += by_ns  # in place: `build` reads them there
+                stream = replace(source.stream, begin_ns=int(t_ns[0]), end_ns=int(t_ns[-1]))
+                self._sources[k] = replace(source, stream=stream)
+                self.streams = tuple(stream if s.name == camera else s for s in self.streams)
+
     def _load(self, path: Path, sensor: str, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
         text = read_table(path)
@@ -335,7 +386,7 @@ class AslRecording(Recording):
         if self._as_recorded or already_even(t_ns):
             return t_ns
         marks = np.arange(len(t_ns))  # whether files of images are equal would take long to find out
-        if kind != "compressed":
+        if kind in ("points", "tracks"):
             marks = np.array([mark_of(build(i)) for i in range(len(t_ns))], dtype=np.int64)
         stamps = CameraStamps(t_ns, marks)
         wanted, reader = stamps.wanted, PointReader(kind)
@@ -380,7 +431,7 @@ class AslRecording(Recording):
         return kept
 
     def _stream(self, kind: Kind, name: str, path: Path, t_ns: IntArray) -> Stream:
-        keys = {"imu": IMU, "points": POINTS, "tracks": TRACKS, "compressed": COMPRESSED}
+        keys = {"imu": IMU, "points": POINTS, "tracks": TRACKS, "compressed": COMPRESSED, "image": IMAGE}
         if not len(t_ns):
             raise RecordingError(f"{path}: no data")
         if np.abs(t_ns).max() >= 2**31 * 10**9:

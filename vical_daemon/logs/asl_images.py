@@ -21,8 +21,9 @@ IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"} | {
 _OTHER_SUFFIXES = {".tif", ".tiff", ".webp", ".gif", ".jp2", ".exr", ".heic", ".raw", ".npy"}
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _MOST = 0.9  # share of the names that are stamps; the others do not belong to the recording
-_TIMES = ("times.txt", "timestamps.txt", "*timestamps.txt", "*timestamps.csv")
-"""Also `frame_timestamps.txt` (MARS logger) and `VID_..._timestamps.csv` (OpenCamera Sensors)."""
+_TIMES = ("times.txt", "timestamps.txt", "*timestamps.txt", "*timestamps.csv", "frames.csv")
+"""Also `frame_timestamps.txt` (MARS logger), `VID_..._timestamps.csv` (OpenCamera Sensors), `frames.csv`
+(ADVIO)."""
 _TRIED = 50  # images whose size is looked for: the first may be damaged
 
 
@@ -91,7 +92,7 @@ def images_by_name(folder: Path) -> Images:
         rest = [path.name for path in images if path not in named]
         text = f"{len(rest)} images left out, whose names are no stamps, first {rest[:1]}"
         return Images(list(named.values()), stamped, [text] if rest else [])
-    stamps = _times_of(folder, images)
+    stamps, _ = times_of(folder, [path.stem for path in images])
     if stamps or not images:
         unread = _in_order(folder, _OTHER_SUFFIXES)
         text = f"{len(unread)} unreadable images, like {{}}: only png, jpg, pgm, ppm and bmp are read"
@@ -104,24 +105,36 @@ def images_by_name(folder: Path) -> Images:
     return Images([], images, [text])
 
 
-def _times_of(folder: Path, images: list[Path]) -> list[str]:
-    """Return the stamps of a file with a line for each image, `[name] stamp ...`; [] if there is none.
+def times_of(folder: Path, names: list[str]) -> tuple[list[str], Path | None]:
+    """Return the stamps of a file with a line for each image, `[name] stamp ...`, and that file.
 
     A title above them may name the column of the stamps.
+
+    Args:
+        folder: Of the images; the file may also be next to it.
+        names: Of the images, without endings.
+
+    Returns:
+        No stamps where no file has a line for each; then the file is one that has not.
     """
     places = (folder, folder / "data", folder.parent)
-    path = next((p for place in places for name in _TIMES for p in sorted(place.glob(name))), None)
-    if path is None:
-        return []
+    files = [p for place in places for name in _TIMES for p in sorted(place.glob(name))]
+    for path in files:
+        if stamps := _stamps_of(path, names):
+            return stamps, path
+    return [], next(iter(files), None)
+
+
+def _stamps_of(path: Path, names: list[str]) -> list[str]:
     rows = [
         line.replace(",", " ").split() for line in read_table(path).decode("utf-8", "replace").splitlines()
     ]
     rows = [row for row in rows if row]
     above = [row for row in rows if row[0].startswith("#") or not any(map(_is_stamp, row))]
     rows = [row for row in rows if row not in above]
-    if len(rows) != len(images) or not rows:
+    if len(rows) != len(names) or not rows:
         return []
-    named = all(len(row) > 1 and Path(row[0]).stem == p.stem for row, p in zip(rows, images, strict=True))
+    named = all(len(row) > 1 and Path(row[0]).stem == name for row, name in zip(rows, names, strict=True))
     titles = [[name for name in row if name[:1] != "[" and name != "#"] for row in above]
     titles = [title for title in titles if len(title) == len(rows[0])]
     column = next((i for title in titles for i, name in enumerate(title) if "stamp" in name), int(named))

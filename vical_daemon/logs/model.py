@@ -5,9 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from heapq import heappop, heappush, merge
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -90,6 +92,8 @@ class Recording(ABC):
         stamp_sigma_s: By how much the stamps of a sensor may be off together, s: of those that were put on an
             even grid, or are written in coarse steps.
         set_back_s: By how much the clock of a sensor was set back during the recording, s.
+        added_ns: Cameras whose stamps count from their own zero (videos), and what was added to them, ns.
+        unplaced: Those of them that begin at an unknown time. Until it is found, they begin with the IMU.
     """
 
     path: Path
@@ -98,6 +102,16 @@ class Recording(ABC):
     warnings: list[str]
     stamp_sigma_s: dict[str, float]
     set_back_s: dict[str, float]
+    added_ns: Mapping[str, int] = MappingProxyType({})
+    unplaced: AbstractSet[str] = frozenset()
+
+    def place(self, camera: str, by_ns: int) -> None:  # noqa: ARG002
+        """Add to the stamps of a camera in `unplaced`.
+
+        Raises:
+            KeyError: There is no such camera.
+        """
+        raise KeyError(camera)
 
     @property
     def imus(self) -> dict[str, Stream]:

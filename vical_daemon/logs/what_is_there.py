@@ -7,9 +7,10 @@ from itertools import islice
 from pathlib import Path
 
 from vical_daemon.logs.asl_images import IMAGE_SUFFIXES
+from vical_daemon.logs.asl_video import VIDEO_SUFFIXES
 
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".h264", ".h265", ".svo", ".svo2"})
-FROM_VIDEO = "a video is not read: extract its images into cam0/, named by their stamps in ns"
+UNREAD_VIDEOS = frozenset({".h264", ".h265", ".hevc", ".insv", ".svo", ".svo2"})
+FROM_VIDEO = "without stamps that can be read: convert it into an .mp4, or extract its images into cam0/"
 _TABLES = frozenset({".csv", ".txt", ".tsv", ".json"})
 _OF_RECORDINGS = frozenset({"mav0", "oxts"})  # folders: ASL, KITTI
 _LOGS = frozenset({".mcap", ".bag", ".db3"})
@@ -34,11 +35,12 @@ def what_is_there(folder: Path) -> str:
     if recordings:
         return f"; found recordings in it: give one of {_listed(recordings)}"
     tables = [e.name for e in entries if e.suffix.lower() in _TABLES]
-    videos = [e.name for e in entries if e.suffix.lower() in VIDEOS]
+    videos = [e.name for e in entries if e.suffix.lower() in VIDEO_SUFFIXES]
     found = [
         images_in(folder),
         f"tables {_listed(tables)}" if tables else "",
-        f"{_listed(videos)} ({FROM_VIDEO})" if videos else "",
+        f"videos {_listed(videos)}" if videos else "",
+        unread_videos_in(folder),
     ]
     return f"; found {', '.join(filter(None, found))}" if any(found) else ""
 
@@ -62,6 +64,12 @@ def images_in(folder: Path) -> str:
         if any(file.suffix.lower() in IMAGE_SUFFIXES for file in _entries(place))
     ]
     return f"images in {_listed(names)}" if names else ""
+
+
+def unread_videos_in(folder: Path) -> str:
+    """Return which videos of a folder are not read, and what to do; empty: none."""
+    videos = [e.name for e in _entries(folder) if e.suffix.lower() in UNREAD_VIDEOS]
+    return f"{_listed(videos)} ({FROM_VIDEO})" if videos else ""
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -21,6 +21,8 @@ from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.logs.channel import stamp_of, with_stamp
 from vical_daemon.offline.accel_shift import STRAIGHT_S
 from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
+from vical_daemon.offline.errors import OptionError
+from vical_daemon.offline.td_icp.own_clock import placed
 from vical_daemon.offline.trace import Trace
 
 if TYPE_CHECKING:
@@ -51,6 +53,7 @@ class InputUse:
         imu: Biases at its end, as in the result, or, of a split recording, at the end of its last file; None:
             it is not in the result.
         timeshifts_s: By camera, at its end.
+        added_s: By camera, what was added to its stamps before that (videos), s.
     """
 
     path: str
@@ -59,13 +62,15 @@ class InputUse:
     frames: int
     imu: dict[str, Any] | None
     timeshifts_s: dict[str, float] = field(default_factory=dict)
+    added_s: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `--json` prints it."""
         biases = {key: self.imu[key] for key in ("gyro_bias_rps", "accel_bias_mps2")} if self.imu else {}
         rest = {"begin_s": self.begin_s, "duration_s": self.duration_s, "frames": self.frames}
         shifts = {"timeshift_cam_imu_s": self.timeshifts_s} if self.imu else {}
-        return {"path": self.path, "used": self.imu is not None, **rest, **biases, **shifts}
+        added = {"added_to_stamps_s": self.added_s} if self.added_s else {}
+        return {"path": self.path, "used": self.imu is not None, **rest, **biases, **shifts, **added}
 
 
 @dataclass(slots=True)
@@ -110,6 +115,7 @@ def run_job(
         enough: Called with each estimate, once a second of data; True: the rest is not needed.
         closed: Called with each complete window, of one camera without a target.
     """
+    _place(job)
     passes = _PASSES if enough is None and closed is None else 1  # those would see some data twice
     while True:
         frames: list[FrameReport] = []
@@ -140,6 +146,22 @@ def run_job(
     return Outcome(
         replace(role.latest, events=player.events), player.trace.points, frames, used, checks, left_out, wrong
     )
+
+
+def _place(job: Job) -> None:
+    """Find when videos begin; from then on each has a time shift of its own, and a given one says nothing."""
+    for part in job.parts:
+        for name, stream in part.cameras.items():
+            if stream.name not in part.recording.unplaced:
+                continue
+            if "timeshift" in job.config.calibration.fix:
+                raise OptionError(f"--fix timeshift: {name} is a video with a clock of its own; leave it out")
+            prior = replace(job.priors[name], timeshift_cam_imu_s=None)
+            job.priors[name] = prior
+            target = job.config.target
+            place = part.recording, part.imu.name, stream, prior, target
+            part.cameras[name] = placed(*place, job.warn)
+            job.common_clock = False
 
 
 class _Player:
@@ -256,7 +278,9 @@ def _play_all(
         for number in files:
             part, counted = parts[number], of_it[number] if imu else 0
             begin_s = (part.begin_ns + later_ns - parts[0].begin_ns) * 1e-9
-            uses[number] = InputUse(str(part.recording.path), begin_s, part.duration_s, counted, imu, shifts)
+            added = {x: ns * 1e-9 for x, ns in part.recording.added_ns.items()}
+            path = str(part.recording.path)
+            uses[number] = InputUse(path, begin_s, part.duration_s, counted, imu, shifts, added)
         if ends:
             break
         free_ns = parts[files[-1]].end_ns + later_ns + _APART_NS
@@ -300,6 +324,8 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
         camera["resolution"] = list(job.priors[name].resolution)
         if job.cameras[name].topic:
             camera["topic"] = job.cameras[name].topic
+        if (added_ns := job.recording.added_ns.get(job.cameras[name].name)) is not None:
+            camera["added_to_stamps_s"] = added_ns * 1e-9
     if result["imu"] is not None:
         result["imu"] |= {"name": job.imu.name, "noise": asdict(noise_of(job))}
     result["warnings"] = [text for part in job.parts for text in part.recording.warnings]

@@ -16,7 +16,7 @@ from vical_daemon.logs.channel import force_of, negative, stamp_of, with_force
 from vical_daemon.logs.what_is_there import whole_recording
 from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.camera_names import priors_meant
-from vical_daemon.offline.errors import InputError, OptionError, size_unknown
+from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore, size_unknown
 
 _COPIED = 0.05  # share of the readings; where a log was split, a few may be in both files
 
@@ -36,6 +36,7 @@ class Job:
         others: Further recordings of the same rig, in the order in which they are used.
         common_clock: The time shift is the same in all recordings.
         accel_late: By how many readings the accelerometer is behind the gyro, see `AccelShift`.
+        warn: Takes what is found out about the recordings while they are used.
         negate_force: Use the accelerometer with the opposite sign, to find out whether that is the mistake.
     """
 
@@ -50,6 +51,7 @@ class Job:
     common_clock: bool = True
     accel_late: int = 0
     negate_force: bool = False
+    warn: Warn = ignore
 
     @property
     def duration_s(self) -> float:

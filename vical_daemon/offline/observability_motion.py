@@ -21,6 +21,7 @@ from vical_daemon.logs.checks import check_imu
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 from vical_daemon.offline.observability_tracks import MAX_FRAMES, MAX_SECONDS, motion_without_board
 from vical_daemon.offline.td_icp.gyro_unit import with_unit_named
+from vical_daemon.offline.td_icp.own_clock import placed
 from vical_daemon.offline.td_icp.request import choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
@@ -69,6 +70,8 @@ def motion_of(
     if stream.kind == "tracks":
         raise InputError(f"{name} holds tracks of unknown points: leave out --target")
     lens = lens_of(stream, prior)
+    if target is not None:
+        stream = placed(recording, imu or next(iter(recording.imus)), stream, prior, target, warn)
     poses, fit = board_poses(recording, stream, lens, target, warn)
     gyro, force = readings.gyro_rps, readings.specific_force_mps2
     base = int(readings.t_ns[0])

@@ -23,6 +23,7 @@ BLOCKS = {"position": POSITION, "rotation": ROTATION, "time shift": SHIFT, "lens
 ASSUMED_POSITION_M = 1e-3
 ASSUMED_ROTATION_RAD = float(np.deg2rad(0.05))
 ASSUMED_SHIFT_S = 1e-4  # docs/benchmarks.md: OpenVINS, 0.02 to 0.05 ms; Kalibr's halves 0.017 ms; times two
+ANY_SHIFT_S = 1.0  # sigma of a time shift that is not known; those of videos were moved to within some ms
 ASSUMED_LENS_SHARE = 1e-3  # of the focal length; EuRoC's free lens: 0.7 of 460 px
 ASSUMED_DISTORTION = 5e-3  # times the square of the radius at the border, 0.7: the same 0.25 % of f there
 
@@ -83,6 +84,14 @@ class KnownCamera:
     def without_lens(self) -> KnownCamera:
         """Mounting and time shift alone, whatever the lens."""
         return replace(self, lens=None, covariance=self.covariance[:7, :7])
+
+    def with_any_shift(self) -> KnownCamera:
+        """The same without its time shift: a video has a clock of its own, which begins with it."""
+        covariance = self.covariance.copy()
+        covariance[SHIFT, :] = covariance[:, SHIFT] = 0.0
+        covariance[SHIFT, SHIFT] = ANY_SHIFT_S**2
+        notes = (*self.notes, "the time shift is not compared: a video has a clock of its own")
+        return replace(self, covariance=covariance, notes=notes)
 
 
 def known_cameras(rig: Rig, source: str) -> dict[str, KnownCamera]:

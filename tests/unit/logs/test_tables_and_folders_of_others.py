@@ -86,7 +86,8 @@ def test_a_copy_in_the_folder_is_named(asl_folder, tmp_path):
     [
         (["run1/mav0/x", "run2/a.bag"], "found recordings in it: give one of run1, run2"),
         (["img/0.png", "imu.txt"], r"found images in img/, tables imu\.txt$"),
-        (["movie.MP4", "gyro.csv"], r"tables gyro\.csv, movie\.MP4 \(a video is not read: extract its"),
+        (["movie.MP4", "gyro.csv"], r"imu0\.csv and a video; found tables gyro\.csv, videos movie\.MP4$"),
+        (["movie.h264", "imu0.csv"], r"found movie\.h264 \(without stamps that can be read: convert it"),
         (["left/data/0.jpg", "imu0.csv"], r"cam0, cam1 \.\.\.; found images in left/data/"),
         (["cam0/1600000000000000000.png", "imu0.txt"], r"no IMU data: .* images in cam0/, tables imu0\.txt"),
     ],
@@ -112,7 +113,5 @@ def test_a_part_in_place_of_the_recording_is_named(folder, part):
 
 def test_a_video_is_no_recording(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"x")
-    with pytest.raises(
-        RecordingError, match=r"a\.mp4 is no recording: a video is not read: extract its images"
-    ):
+    with pytest.raises(RecordingError, match=r"a\.mp4 is a video: give the folder that holds it and a table"):
         open_recording(tmp_path / "a.mp4")

@@ -15,8 +15,9 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
+from vical_daemon.results.change_odds import Counts
 from vical_daemon.results.export import rig_from_estimate
-from vical_daemon.results.known import known_cameras
+from vical_daemon.results.known import ANY_SHIFT_S, known_cameras
 from vical_daemon.results.verifier import Answer, CameraCheck, Verifier
 
 LENS = [458.0, 457.0, 367.0, 248.0]
@@ -183,3 +184,15 @@ def test_a_rig_holds_if_every_camera_does(stored):
     both = replace(both, cameras=both.cameras | {"cam1": both.cameras["cam0"]})
     assert verifier.look(both)
     assert verifier.answer is Answer.HOLDS
+
+
+def test_the_time_shift_of_a_video_is_not_compared(stored):
+    """Its clock begins with it: whatever its stamps were moved by first is not the rig's."""
+    e = np.zeros(len(stored.sigma))
+    e[6] = 1e-2
+    for known, verdict in ((stored, Answer.CHANGED), (stored.with_any_shift(), Answer.HOLDS)):
+        verifier = Verifier({"cam0": CameraCheck(known)}, Counts(timeshift_s=10.0 * ANY_SHIFT_S))
+        if known is stored:
+            verifier = Verifier({"cam0": CameraCheck(known)})
+        verifier.look(estimate(e))
+        assert verifier.answer is verdict

@@ -20,6 +20,7 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, Orientat
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
 GRID_S = 0.01  # of shifts: a hand's rate changes over 0.1 s; a quarter of it about the best ones
+_AT_ONCE = 1000  # shifts that are compared together: 30 MB with 300 turns; the default search has 1001
 _CANDIDATES = 4  # shifts whose directions are compared too: periodic motion agrees in size at several
 
 
@@ -79,10 +80,14 @@ def shift_costs(
     offsets = np.round(shifts_s / step).astype(np.intp)
     a = np.round((t_cam_s[turns.first] - start) / step).astype(np.intp)
     b = np.round((t_cam_s[turns.second] - start) / step).astype(np.intp)
-    ia, ib = a + offsets[:, None], b + offsets[:, None]
-    inside = (ia >= 0) & (ib < len(grid))
-    angle = angles_between(grid[np.where(inside, ia, 0)], grid[np.where(inside, ib, 0)])
-    return np.asarray(np.where(inside, robust_cost(angle - turns.angle, scale), 0.6).mean(axis=1))
+    costs = np.empty(len(offsets))
+    for begin in range(0, len(offsets), _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        ia, ib = a + offsets[part, None], b + offsets[part, None]
+        inside = (ia >= 0) & (ib < len(grid))
+        angle = angles_between(grid[np.where(inside, ia, 0)], grid[np.where(inside, ib, 0)])
+        costs[part] = np.where(inside, robust_cost(angle - turns.angle, scale), 0.6).mean(axis=1)
+    return costs
 
 
 def agreement_scale(turns: Turns) -> float:

@@ -12,6 +12,7 @@ from vical_daemon.estimation.temporal.td_icp_input import OrientationStream, cle
 from vical_daemon.estimation.temporal.td_icp_result import JointResult
 from vical_daemon.logs import Recording, RecordingError
 from vical_daemon.offline.errors import InputError, OptionError
+from vical_daemon.offline.td_icp.own_clock import placed
 from vical_daemon.offline.td_icp.recorded_orientations import pose_topic, trajectory_file
 from vical_daemon.offline.td_icp.request import TdIcpRequest, choose_gyro, is_trajectory, prior_of
 from vical_daemon.offline.td_icp.sources import LensUsed, camera_stream, seconds
@@ -48,6 +49,8 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
             streams.append(_integrated(recording, name, base_ns))
         elif recording is not None and name in recording.cameras and base_ns is not None:
             camera, prior = recording.cameras[name], prior_of(request.initial, name)
+            if gyros and request.target:
+                camera = placed(recording, gyros[0], camera, prior, request.target, request.warn)
             stream, lenses[name] = camera_stream(
                 recording, camera, prior, request.target, base_ns, request.warn
             )

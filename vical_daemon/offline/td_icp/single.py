@@ -14,6 +14,7 @@ from vical_daemon.estimation.temporal.track_registration import track_registrati
 from vical_daemon.logs import Recording, meant
 from vical_daemon.offline.errors import InputError, OptionError
 from vical_daemon.offline.td_icp.gyro_unit import with_unit_named
+from vical_daemon.offline.td_icp.own_clock import placed
 from vical_daemon.offline.td_icp.request import TdIcpRequest, choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import LensUsed, camera_stream, seconds, track_frames
 
@@ -54,6 +55,8 @@ def register_camera(request: TdIcpRequest, watch_s: float | None = None) -> Sing
     imu, t_ns, gyro = choose_gyro(recording, request.imu)
     base, stream = int(t_ns[0]), recording.cameras[camera]
     t_imu, prior, options = seconds(t_ns, base), prior_of(request.initial, camera), request.options
+    if request.target:
+        stream = placed(recording, imu, stream, prior, request.target, request.warn)
     if stream.kind == "tracks":
         frames, used = track_frames(recording, stream, prior, base)
         lens = (used.lens.intrinsics, used.lens.distortion, used.lens.distortion_model)

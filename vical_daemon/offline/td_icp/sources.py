@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from vical_daemon.estimation.temporal.camera_orientations import Orientations, t
 from vical_daemon.estimation.temporal.td_icp_input import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.logs import Recording, Stream
+from vical_daemon.logs.channel import stamp_of
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore, size_unknown
 
 FloatArray = npt.NDArray[np.float64]
@@ -101,7 +103,12 @@ def track_frames(
 
 
 def board_poses(
-    recording: Recording, stream: Stream, lens: CameraState, target: str | None, warn: Warn = ignore
+    recording: Recording,
+    stream: Stream,
+    lens: CameraState,
+    target: str | None,
+    warn: Warn = ignore,
+    every_s: float = 0.0,
 ) -> tuple[Orientations, LensFit | None]:
     """Find the board in a camera's frames, improve the lens by them, and return the camera's poses.
 
@@ -111,6 +118,7 @@ def board_poses(
         lens: Start; improved in place.
         target: Target file.
         warn: Takes what is unusual.
+        every_s: The board is looked for in images that are at least so far apart, s.
 
     Raises:
         InputError: No target, or it does not fit the data.
@@ -120,7 +128,7 @@ def board_poses(
     from vical_daemon.vision.target import load_target
 
     points_m = load_target(Path(target)).points_m
-    frames = _frames(recording, stream, target, warn)
+    frames = _frames(recording, stream, target, warn, every_s)
     if not any(len(f.ids) for f in frames):
         raise InputError(f"{stream.name}: the target was found in no image; is it the right target file?")
     if max(int(f.ids.max()) for f in frames if len(f.ids)) >= len(points_m):
@@ -152,7 +160,9 @@ def _stream(name: str, found: Orientations, base_ns: int) -> OrientationStream:
     return OrientationStream(name, seconds(found.t_cam_ns, base_ns), found.R_world_cam, found.covariance)
 
 
-def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> list[PointsFrame]:
+def _frames(
+    recording: Recording, stream: Stream, target: str, warn: Warn, every_s: float
+) -> list[PointsFrame]:
     if stream.kind == "points":
         return [f for f in recording.points_frames(stream.name) if len(f.ids)]
     from vical_daemon.vision.detector import BoardDetector
@@ -162,13 +172,16 @@ def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> li
     board = load_target(Path(target))
     check = TargetCheck(board, lambda text: warn(f"{stream.name}: {text}"))
     detect = BoardDetector(board, check=check).detect
-    frames, unreadable = [], 0
+    frames, unreadable, next_ns = [], 0, -math.inf
     for _, payload in recording.messages([stream]):
+        if (stamp_of(payload) or 0) < next_ns:
+            continue
         try:
             stamp_ns, image = image_of(payload, stream.kind)
         except ValueError:  # damaged, or larger than an image can be: as the service, which counts them
             unreadable += 1
             continue
+        next_ns = stamp_ns + 0.9e9 * every_s  # a period of the images does not divide it evenly
         found = detect(image, stamp_ns)
         if found is not None and len(found.ids):
             frames.append(PointsFrame(stream.name, stamp_ns, found.ids, found.uv_px, found.sigma_px))

@@ -11,6 +11,8 @@ from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.delay_windows import delay_windows
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve
+from vical_daemon.estimation.temporal.rotation_start import shift_costs
+from vical_daemon.estimation.temporal.rotation_turns import camera_turns
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 from vical_daemon.estimation.temporal.track_orientations import relative_rotations, track_orientations
 
@@ -129,3 +131,17 @@ def test_windows_follow_the_delay_and_announce_a_jump():
     assert abs(reports[0].timeshift_s - 0.010) < 5 * reports[0].timeshift_sigma_s
     assert any(r.jumped for r in reports)
     assert abs(reports[-1].timeshift_s - 0.030) < 5 * reports[-1].timeshift_sigma_s
+
+
+def test_costs_of_many_shifts_are_those_of_a_few():
+    """A long search compares them in parts: memory must not grow with its length."""
+    run = simulate(3, 40.0)
+    t_s = (run.t_imu_ns - run.t_imu_ns[0]) * 1e-9
+    curve = GyroCurve.integrate(t_s, run.gyro_rps, np.zeros(3))
+    t_cam_s = np.arange(12.0, 20.0, 0.1)
+    turns = camera_turns(t_cam_s - 3.0, curve.quaternion(t_cam_s))
+    shifts_s = np.arange(-1500, 3500) * 0.01
+    costs = shift_costs(curve, t_cam_s - 3.0, turns, shifts_s, 0.1)
+    assert abs(shifts_s[np.argmin(costs)] - 3.0) < 0.011
+    few = slice(1200, 1900)
+    np.testing.assert_array_equal(costs[few], shift_costs(curve, t_cam_s - 3.0, turns, shifts_s[few], 0.1))
