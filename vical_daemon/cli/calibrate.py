@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named, suggest, warn
+from vical_daemon.cli.options import RECORDING, add_json, add_sensors, add_stretch, named, suggest, warn
 from vical_daemon.service.atomic_file import write_output
 
 if TYPE_CHECKING:
@@ -49,8 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "inputs",
         metavar="INPUT",
         nargs="+",
-        help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with video and IMU table; several recordings "
-        "of one rig make one calibration",
+        help=f"{RECORDING}; several recordings of one rig make one calibration",
     )
     add_sensors(parser)
     parser.add_argument(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, warn
+from vical_daemon.cli.options import RECORDING, add_json, warn
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.guidance import WeakDirection
@@ -29,11 +29,7 @@ example:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with video and IMU table",
-    )
+    parser.add_argument("input", metavar="INPUT", help=RECORDING)
     parser.add_argument("--target", metavar="FILE", help="target file of the board, Kalibr's format")
     parser.add_argument("--initial", metavar="FILE", help="Kalibr's files with prior values")
     parser.add_argument("--camera", metavar="NAME", help="which camera, if there are several")

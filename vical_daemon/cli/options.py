@@ -14,6 +14,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 
 _WRITTEN = ("output", "out", "report", "yaml")
 """Options, of all commands, that name a file to write."""
+RECORDING = "MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with a video and an IMU's table"
 _REMARK = "   "  # between an example and what is said about it
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import ProgressBar, finite
 from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, add_sensors, add_stretch, named, warn
+from vical_daemon.cli.options import RECORDING, add_json, add_sensors, add_stretch, named, warn
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
@@ -37,11 +37,7 @@ exit code: 0 holds; 4 no longer holds; 5 this recording cannot tell; 1 it cannot
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the recording, the calibration, and what counts as a change."""
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a folder with video and IMU table",
-    )
+    parser.add_argument("input", metavar="INPUT", help=RECORDING)
     parser.add_argument(
         "--against",
         metavar="SOURCE",

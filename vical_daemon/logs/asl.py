@@ -130,19 +130,20 @@ class AslRecording(Recording):
         self.streams = tuple(source.stream for source in self._sources)
         if not self.streams and names is not None and imus:
             raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
+        self._refuse_nothing(root)
+        if not (folders or self.cameras) and names is None:
+            lost = images_in(root) or unread_videos_in(root)
+            self.warnings += [f"no cameras: their folders must be cam0, cam1 ...; found {lost}"] * bool(lost)
+
+    def _refuse_nothing(self, root: Path) -> None:
+        """Refuse a folder without anything that can be read, and say what is expected."""
         if not self.streams:
             raise RecordingError(
-                f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
+                f"{self.path} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
                 "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz], or "
                 "Kalibr's imu0.csv and cam0/ with images named by their stamps, ns, or imu0.csv and a video"
                 f"{what_is_there(root)}"
             )
-        if (
-            not (folders or self.cameras)
-            and names is None
-            and (found := images_in(root) or unread_videos_in(root))
-        ):
-            self.warnings.append(f"no cameras: their folders must be cam0, cam1 ...; found {found}")
 
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`."""

@@ -70,8 +70,7 @@ def motion_of(
     if stream.kind == "tracks":
         raise InputError(f"{name} holds tracks of unknown points: leave out --target")
     lens = lens_of(stream, prior)
-    if target is not None:
-        stream = placed(recording, imu or next(iter(recording.imus)), stream, prior, target, warn)
+    stream = placed(recording, choose_gyro(recording, imu)[0], stream, prior, target, warn)
     poses, fit = board_poses(recording, stream, lens, target, warn)
     gyro, force = readings.gyro_rps, readings.specific_force_mps2
     base = int(readings.t_ns[0])
