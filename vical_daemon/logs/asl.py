@@ -37,10 +37,17 @@ from vical_daemon.logs.model import (
     Stream,
     stream_statistics,
 )
-from vical_daemon.logs.stamp_column import column_ns
+from vical_daemon.logs.stamp_column import StampColumn, column_ns, counter_ns
 from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back_s
 from vical_daemon.logs.table_text import FIRST_ROW, titles
-from vical_daemon.logs.titled_columns import IN_DEGREES, columns_by_title, degrees_named, reordered
+from vical_daemon.logs.titled_columns import (
+    IN_DEGREES,
+    columns_by_title,
+    counts_only,
+    degrees_named,
+    rate_named,
+    reordered,
+)
 from vical_daemon.logs.two_tables import SensorTable, one_table, two_sensors
 from vical_daemon.logs.united_imu import forces_at
 from vical_daemon.logs.what_is_there import images_in, unread_videos_in, what_is_there
@@ -55,16 +62,16 @@ _BLOCK = 4096  # readings that are turned into messages together
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
-def _refuse_lost_digits(path: Path, texts: npt.NDArray[Any], t_ns: IntArray) -> None:
-    """Refuse stamps like 1.404733e+18, which do not tell one reading from the next.
+def _refuse_lost_digits(path: Path, texts: npt.NDArray[Any], column: StampColumn) -> None:
+    """Refuse stamps like 1.404733e+18, or 45000.12346 days, which do not tell one reading from the next.
 
     Raises:
-        RecordingError: Most stamps are equal to others, and they are written with an exponent.
+        RecordingError: Most stamps are equal to others, and are written with an exponent, or as days.
     """
-    different = len(np.unique(t_ns))
-    if different < len(t_ns) / 2 and "e" in texts[0].lower():
+    different, count = len(np.unique(column.t_ns)), len(column.t_ns)
+    if different < count / 2 and ("e" in texts[0].lower() or "days" in column.report):
         raise RecordingError(
-            f"{path}: only {different} different stamps in {len(t_ns)} rows, written like {texts[0]}: digits "
+            f"{path}: only {different} different stamps in {count} rows, written like {texts[0]}: digits "
             "are lost; write them as integers, nanoseconds"
         )
 
@@ -348,6 +355,8 @@ class AslRecording(Recording):
         rows = load_table(whole, path, dtype, columns)
         try:
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
+            if dtype == _IMU_ROW and counts_only(title):
+                stamps, title = self._counted(stamps, lines, path, sensor), "ns"
             column = column_ns(stamps, title, imu=dtype == _IMU_ROW)
         except StampError as error:
             text_ = not_a_stamp(str(rows["t"][error.index]))
@@ -356,12 +365,23 @@ class AslRecording(Recording):
         if back_s := set_back_s(column.t_ns):
             self.set_back_s[sensor] = back_s
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
-            _refuse_lost_digits(path, rows["t"], column.t_ns)
+            _refuse_lost_digits(path, rows["t"], column)
         out = np.empty(len(rows), dtype)
         out["t"] = column.t_ns
         for name in (dtype.names or ())[1:]:
             out[name] = rows[name]
         return out
+
+    def _counted(self, ticks: Any, lines: list[str], path: Path, sensor: str) -> IntArray:
+        """Return the stamps of rows that are merely numbered, if a line above them names the rate."""
+        rate_hz = rate_named(lines)
+        if not rate_hz:
+            raise RecordingError(
+                f"{path}: its rows have a counter, but no time, and no line above them names the rate (like "
+                "Update Rate: 100.0Hz): export the time, too (Xsens: SampleTimeFine)"
+            )
+        self.warnings.append(f"{sensor}: its rows are counted; the {rate_hz:g} Hz named date them")
+        return counter_ns(np.array(ticks, dtype=np.int64), rate_hz)
 
     def _note_stamps(self, name: str, sigma_s: float, report: str = "") -> None:
         """Add what is found about the stamps of a sensor; errors of several causes add up."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.stamps import (
     UNIT_WORDS,
     resolution_ns,
@@ -29,6 +29,11 @@ _COARSE_NS = 100_000
 is 0.025 px, a tenth of what corners have."""
 
 
+_XSENS_BITS, _COUNTER_BITS = 32, 16  # MT Low Level Communication Protocol: SampleTimeFine, PacketCounter
+_DAY_S = 86_400
+_EPOCHS = (719_529, 25_569)
+"""1970 in days of MATLAB (from the year 0), and of spreadsheets (from 1899-12-30); others have a zero of their
+own."""
 _XSENS, _XSENS_STEP = "sampletimefine", 5000
 """A counter of Xsens: an MTi counts 0.1 ms, a DOT us. So step by step it grows by less than this (2 Hz of an
 MTi, 200 Hz of a DOT, which has at most 120), or by more."""
@@ -66,9 +71,14 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
     """
     slowest, fastest, usual = _IMU_HZ if imu else _CAMERA_HZ
     if _XSENS in title.lower() and len(values) > 1:
-        ticks = np.array(values, dtype=np.float64)
+        ticks = unwrapped(np.array(values, dtype=np.float64), _XSENS_BITS)
         tenths = float(np.median(np.diff(ticks))) < _XSENS_STEP
         title, values = "us", np.round(ticks * (100 if tenths else 1)).astype(np.int64)
+    if not isinstance(values, np.ndarray) and (dates := _days(values, slowest, fastest)):
+        t_ns = to_ns(dates, "s")
+        coarse, sigma_s = coarseness(t_ns, _DAY_S * resolution_ns(values, "s"))
+        read_as = "by their spacing the stamps are days; read as such"
+        return StampColumn(t_ns, "; ".join(filter(None, [read_as, coarse])), sigma_s)
     if isinstance(values, np.ndarray):
         distinct: list[int] = np.unique(values).tolist()
         unit = unit_by_spacing(distinct, slowest, fastest, usual)
@@ -85,6 +95,32 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
     coarse, sigma_s = coarseness(t_ns, step_ns)
     read_as = "" if unit == "ns" else f"by their spacing the stamps are {UNIT_WORDS[unit]}; read as such"
     return StampColumn(t_ns, "; ".join(filter(None, [read_as, coarse])), sigma_s)
+
+
+def _days(values: list[int] | list[Decimal], slowest_hz: float, fastest_hz: float) -> list[Decimal]:
+    """Return the UNIX time, s, of stamps in days, as spreadsheets and MATLAB write dates; []: they are not.
+
+    Only days make such short steps plausible: as seconds they would be 40 kHz and more.
+    """
+    ordered = np.unique(np.array(values, dtype=np.float64))
+    step_s = _DAY_S * float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.0
+    if not 0.9 / fastest_hz <= step_s <= 1.1 / slowest_hz:
+        return []
+    epoch = next((day for day in _EPOCHS if ordered[0] > day), 0)
+    return [(Decimal(value) - epoch) * _DAY_S for value in values]
+
+
+def unwrapped(ticks: FloatArray, bits: int) -> FloatArray:
+    """Return a counter of so many bits that goes on where it began anew, shape (n,)."""
+    whole = float(2**bits)
+    return ticks + whole * np.append(0, np.cumsum(np.diff(ticks) < -0.5 * whole))
+
+
+def counter_ns(ticks: IntArray, rate_hz: float) -> IntArray:
+    """Return the stamps, ns, of readings that are counted with 16 bits, at a rate that is known."""
+    counted = unwrapped(ticks.astype(np.float64), _COUNTER_BITS)
+    t_ns: IntArray = np.round((counted - counted[0]) * (1e9 / rate_hz)).astype(np.int64)
+    return t_ns
 
 
 def coarseness(t_ns: IntArray, step_ns: float = 1.0) -> tuple[str, float]:

@@ -12,6 +12,8 @@ _GYRO = re.compile(r"gyr|omega|ang\w*\W?(vel|rate|speed)|rot\w*\W?(vel|rate|spee
 _ACCEL = re.compile(r"acc|specific|force|^a_?(rs_s)?_?[xyz]$|^f_?[xyz]$")
 _DEGREES = re.compile(r"deg|dps|°")
 _STAMP = re.compile(r"time|stamp|^ts?$|^ts_|^t_|^cts$")
+_COUNTER = re.compile(r"count(er)?$")
+_RATE = re.compile(r"(?:update|sampl\w*|output)[ _]?rate\W*(\d+(?:\.\d+)?) *Hz", re.IGNORECASE)
 _AROUND = ' #%\t\r\n"\ufeff'
 _WHOLE, _REST = re.compile(r"stamp\W?secs?$"), re.compile(r"stamp\W?nsecs?$|stamp\W?nanosecs?$")
 
@@ -79,6 +81,23 @@ def axes_by_title(title: str) -> Columns | None:
         axes = [first, first + 1, first + 2]
     stamp, rest = _stamp_of(names, axes)
     return Columns((stamp, *axes), rest)
+
+
+def counts_only(title: str) -> bool:
+    """Whether the column that is taken for the stamps counts rows: there is no time.
+
+    >>> counts_only("PacketCounter,gx,gy,gz,ax,ay,az"), counts_only("utc,count,gx,gy,gz,ax,ay,az")
+    (True, False)
+    """
+    columns = columns_by_title(title)
+    name = title.split(",")[0 if columns is None else columns.numbers[0]]
+    return _COUNTER.search(_plain(name)) is not None
+
+
+def rate_named(lines: list[str]) -> float | None:
+    """Return the rate that lines above a table name, Hz: `// Update Rate: 100.0Hz`; None: they do not."""
+    found = (_RATE.search(line) for line in lines)
+    return next((float(match[1]) for match in found if match), None)
 
 
 def names_degrees(title: str) -> bool:

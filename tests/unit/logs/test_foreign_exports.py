@@ -80,6 +80,50 @@ def test_columns_are_found_by_the_names_that_programs_give_them(asl_folder, tmp_
     np.testing.assert_array_equal(found.specific_force_mps2, expected.specific_force_mps2)
 
 
+@pytest.mark.parametrize("epoch_days", [25_569, 719_529])  # 1970 in Excel's and in MATLAB's days
+def test_stamps_may_be_days(asl_folder, tmp_path, epoch_days):
+    expected = open_recording(asl_folder, as_recorded=True).imu_arrays("imu0")
+    rows, day_ns = readings(asl_folder), 86_400 * 10**9
+    written = [(f"{t // day_ns + epoch_days}.{t % day_ns * 10**12 // day_ns:012d}", w, f) for t, w, f in rows]
+    lines = [",".join(row) for row in written]
+    folder = folder_with(asl_folder, tmp_path, "imu0.csv", ["time,gx,gy,gz,ax,ay,az", *lines])
+    found = open_recording(folder)
+    assert np.abs(found.imu_arrays("imu0").t_ns - expected.t_ns).max() <= 100
+    assert any("by their spacing the stamps are days" in text for text in found.warnings)
+    few = [",".join((t[:-6], w, f)) for t, w, f in written]  # as a spreadsheet shows them
+    (folder / "imu0.csv").write_text("\n".join(["time,gx,gy,gz,ax,ay,az", *few]) + "\n")
+    with pytest.raises(RecordingError, match=r"written like \d+\.\d{6}: digits are lost"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("step_ns", [100_000, 1000])  # an MTi, a DOT
+def test_counters_of_xsens_go_on_where_they_begin_anew(asl_folder, tmp_path, step_ns):
+    rows = readings(asl_folder)
+    since_ns = np.array([row[0] - rows[0][0] for row in rows])
+    late = [
+        (t + (2**32 - 5000) * step_ns, w, f) for t, (_, w, f) in zip(since_ns.tolist(), rows, strict=True)
+    ]
+    lines = [line.split("\t") for line in xsens(late, step_ns)]
+    for line in lines[4:]:
+        line[1] = str(int(line[1]) % 2**32)
+    (tmp_path / "imu0.txt").write_text("\n".join("\t".join(line) for line in lines))
+    t_ns = open_recording(tmp_path, as_recorded=True).imu_arrays("imu0").t_ns
+    np.testing.assert_allclose(t_ns - t_ns[0], since_ns, atol=step_ns)
+
+
+def test_rows_that_are_only_counted_need_a_rate(asl_folder, tmp_path):
+    names = "PacketCounter,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
+    rows = [f"{(65_000 + k) % 2**16:05d},{f},{w}" for k, (_, w, f) in enumerate(readings(asl_folder))]
+    above = ["// Start Time: Unknown", "// Update Rate: 200.0Hz"]
+    (tmp_path / "imu0.txt").write_text("\n".join([*above, names, *rows]).replace(",", "\t"))
+    recording = open_recording(tmp_path, as_recorded=True)
+    np.testing.assert_array_equal(recording.imu_arrays("imu0").t_ns, np.arange(len(rows)) * 5_000_000)
+    assert any("the 200 Hz named date them" in text for text in recording.warnings)
+    (tmp_path / "imu0.txt").write_text("\n".join([names, *rows]).replace(",", "\t"))
+    with pytest.raises(RecordingError, match=r"a counter, but no time.* export the time, too"):
+        open_recording(tmp_path)
+
+
 def test_an_empty_column_of_stamps_is_named(asl_folder, tmp_path):
     lines = [line.split("\t") for line in xsens(readings(asl_folder), 1000)]
     for line in lines[4:]:
