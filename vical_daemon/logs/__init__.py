@@ -22,7 +22,7 @@ from vical_daemon.logs.checks import check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
-from vical_daemon.logs.what_is_there import FROM_VIDEO, UNREAD_VIDEOS, what_is_there
+from vical_daemon.logs.what_is_there import FROM_VIDEO, UNREAD_VIDEOS, unpacker, what_is_there
 
 __all__ = [
     "LEFT_OUT",
@@ -167,17 +167,6 @@ def _fit(
 
 
 _NEEDED = "expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder (with mav0/imu0/data.csv)"
-_UNPACKERS = {
-    ".gz": "gunzip -k",
-    ".bz2": "bunzip2 -k",
-    ".xz": "unxz -k",
-    ".zst": "zstd -d",
-    ".zstd": "zstd -d",
-    ".zip": "unzip",
-    ".tar": "tar -xf",
-    ".tgz": "tar -xf",
-    ".7z": "7z x",
-}
 _MESSAGES_PACKED = re.compile(r"^\s*compression_mode:\s*['\"]?message", re.IGNORECASE | re.MULTILINE)
 
 
@@ -231,6 +220,6 @@ def _why_not(path: Path) -> str:
         return f"is a video {FROM_VIDEO}"
     if path.suffix.lower() in (".yaml", ".yml"):
         return "is no recording: give a target with --target, Kalibr's camchain or imu.yaml with --initial"
-    if path.suffix in _UNPACKERS:
-        return f"is packed: {_UNPACKERS[path.suffix]} {path.name}"
+    if command := unpacker(path):
+        return f"is packed: {command}"
     return f"is no recording: {_NEEDED}"

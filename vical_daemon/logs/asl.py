@@ -50,7 +50,7 @@ from vical_daemon.logs.titled_columns import (
 )
 from vical_daemon.logs.two_tables import SensorTable, one_table, two_sensors
 from vical_daemon.logs.united_imu import forces_at
-from vical_daemon.logs.what_is_there import images_in, unread_videos_in, what_is_there
+from vical_daemon.logs.what_is_there import images_in, unread_in, what_is_there
 
 RIG = "rig0"
 _CAMERAS = ("cam*", "image_[0-9]*")  # KITTI has image_00 to image_03
@@ -139,7 +139,7 @@ class AslRecording(Recording):
             raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
         self._refuse_nothing(root)
         if not (folders or self.cameras) and names is None:
-            lost = images_in(root) or unread_videos_in(root)
+            lost = images_in(root) or unread_in(root)
             self.warnings += [f"no cameras: their folders must be cam0, cam1 ...; found {lost}"] * bool(lost)
 
     def _refuse_nothing(self, root: Path) -> None:

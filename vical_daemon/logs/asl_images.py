@@ -108,7 +108,8 @@ def images_by_name(folder: Path) -> Images:
 def times_of(folder: Path, names: list[str]) -> tuple[list[str], Path | None]:
     """Return the stamps of a file with a line for each image, `[name] stamp ...`, and that file.
 
-    A title above them may name the column of the stamps.
+    A title above them may name the column of the stamps. If lines begin with names or numbers of images, more
+    lines than images may be there.
 
     Args:
         folder: Of the images; the file may also be next to it.
@@ -132,7 +133,9 @@ def _stamps_of(path: Path, names: list[str]) -> list[str]:
     rows = [row for row in rows if row]
     above = [row for row in rows if row[0].startswith("#") or not any(map(_is_stamp, row))]
     rows = [row for row in rows if row not in above]
-    if len(rows) != len(names) or not rows:
+    if len(rows) != len(names):
+        rows = _lines_of(names, rows)
+    if not rows:
         return []
     named = all(len(row) > 1 and Path(row[0]).stem == name for row, name in zip(rows, names, strict=True))
     titles = [[name for name in row if name[:1] != "[" and name != "#"] for row in above]
@@ -142,11 +145,30 @@ def _stamps_of(path: Path, names: list[str]) -> list[str]:
     return stamps if len(stamps) == len(rows) and all(map(_is_stamp, stamps)) else []
 
 
+def _lines_of(names: list[str], rows: list[list[str]]) -> list[list[str]]:
+    """Return the line of each image by its name, or the number at the end of that; [] if one has none."""
+    by_name = {Path(row[0]).stem: row for row in rows if len(row) > 1}
+    by_number = {int(name): row for name, row in by_name.items() if name.isdecimal()}
+    numbers = [re.findall(r"\d*$", name, re.ASCII)[0] for name in names]
+    found = [by_name.get(a) or by_number.get(int(b or -1)) for a, b in zip(names, numbers, strict=True)]
+    return [[name, *row[1:]] for name, row in zip(names, found, strict=True) if row] if all(found) else []
+
+
 def _in_order(folder: Path, suffixes: set[str]) -> list[Path]:
-    """Return the files with these endings; hidden ones are those of an archive of macOS."""
-    places = [place for place in (folder / "data", folder) if place.is_dir()]
-    files = [path for place in places for path in sorted(place.iterdir(), key=_counted)]
-    return [p for p in files if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    """Return the files with these endings, where there are none those in the folders inside.
+
+    Hidden files are those of an archive of macOS. Equal names in several folders are of several cameras.
+    """
+
+    def inside(places: list[Path]) -> list[Path]:
+        files = [path for place in places for path in sorted(place.iterdir(), key=_counted)]
+        return [p for p in files if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+
+    found = inside([place for place in (folder / "data", folder) if place.is_dir()])
+    if not found and folder.is_dir():
+        found = inside([p for p in sorted(folder.iterdir(), key=_counted) if p.is_dir()])
+        found = found if len({p.name for p in found}) == len(found) else []
+    return found
 
 
 def _counted(path: Path) -> list[tuple[int, str]]:

@@ -120,7 +120,7 @@ def _oddities(video: Video, path: Path) -> list[str]:
 
 def _written(path: Path, count: int, warnings: list[str]) -> StampColumn | None:
     """Return the stamps of a file next to a video; None: there is none that fits."""
-    stamps, file = times_of(path.parent / path.stem, [path.stem] * count)
+    stamps, file = times_of(path.parent / path.stem, list(map(str, range(count))))
     if not stamps:
         if file is not None:
             warnings.append(

@@ -32,8 +32,8 @@ is 0.025 px, a tenth of what corners have."""
 _XSENS_BITS, _COUNTER_BITS = 32, 16  # MT Low Level Communication Protocol: SampleTimeFine, PacketCounter
 _DAY_S = 86_400
 _EPOCHS = (719_529, 25_569)
-"""1970 in days of MATLAB (from the year 0), and of spreadsheets (from 1899-12-30); others have a zero of their
-own."""
+"""1970 in days of MATLAB (from the year 0), and of spreadsheets (from 1899-12-30); others have their
+own zero."""
 _XSENS, _XSENS_STEP = "sampletimefine", 5000
 """A counter of Xsens: an MTi counts 0.1 ms, a DOT us. So step by step it grows by less than this (2 Hz of an
 MTi, 200 Hz of a DOT, which has at most 120), or by more."""

@@ -11,6 +11,21 @@ from vical_daemon.logs.asl_video import VIDEO_SUFFIXES
 
 UNREAD_VIDEOS = frozenset({".h264", ".h265", ".hevc", ".insv", ".svo", ".svo2"})
 FROM_VIDEO = "without stamps that can be read: convert it into an .mp4, or extract its images into cam0/"
+_UNPACKERS = {
+    ".tar.gz": "tar -xf",
+    ".tar.bz2": "tar -xf",
+    ".tar.xz": "tar -xf",
+    ".gz": "gunzip -k",
+    ".bz2": "bunzip2 -k",
+    ".xz": "unxz -k",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+    ".zip": "unzip",
+    ".tar": "tar -xf",
+    ".tgz": "tar -xf",
+    ".7z": "7z x",
+    ".rar": "unrar x",
+}
 _TABLES = frozenset({".csv", ".txt", ".tsv", ".json"})
 _OF_RECORDINGS = frozenset({"mav0", "oxts"})  # folders: ASL, KITTI
 _LOGS = frozenset({".mcap", ".bag", ".db3"})
@@ -40,7 +55,7 @@ def what_is_there(folder: Path) -> str:
         images_in(folder),
         f"tables {_listed(tables)}" if tables else "",
         f"videos {_listed(videos)}" if videos else "",
-        unread_videos_in(folder),
+        unread_in(folder),
     ]
     return f"; found {', '.join(filter(None, found))}" if any(found) else ""
 
@@ -57,19 +72,34 @@ def whole_recording(part: Path) -> str:
 
 def images_in(folder: Path) -> str:
     """Return which folders inside of a folder, or of one in it, hold images; empty: none."""
-    folders = [place for entry in _entries(folder) for place in (entry, *_entries(entry))]
+    folders = [folder, *(place for entry in _entries(folder) for place in (entry, *_entries(entry)))]
     names = [
-        f"{place.relative_to(folder)}/"
+        f"{place.relative_to(folder)}/".replace("./", "the folder itself")
         for place in folders
         if any(file.suffix.lower() in IMAGE_SUFFIXES for file in _entries(place))
     ]
     return f"images in {_listed(names)}" if names else ""
 
 
-def unread_videos_in(folder: Path) -> str:
-    """Return which videos of a folder are not read, and what to do; empty: none."""
+def unread_in(folder: Path) -> str:
+    """Return which videos and archives of a folder are not read, and what to do; empty: none."""
     videos = [e.name for e in _entries(folder) if e.suffix.lower() in UNREAD_VIDEOS]
-    return f"{_listed(videos)} ({FROM_VIDEO})" if videos else ""
+    if videos:
+        return f"{_listed(videos)} ({FROM_VIDEO})"
+    packed = [e for e in _entries(folder) if unpacker(e) and not is_packed_table(e)]
+    return f"{_listed([e.name for e in packed])} (unpack: {unpacker(packed[0])})" if packed else ""
+
+
+def is_packed_table(path: Path) -> bool:
+    """Whether this is a table that is read as it is."""
+    return path.name.lower().endswith(".csv.gz")
+
+
+def unpacker(path: Path) -> str:
+    """Return the command that unpacks a file; empty: it is not packed."""
+    name = path.name.lower()
+    command = next((command for suffix, command in _UNPACKERS.items() if name.endswith(suffix)), "")
+    return f"{command} {path.name}" if command else ""
 
 
 def _entries(folder: Path) -> list[Path]:

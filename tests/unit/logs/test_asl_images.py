@@ -79,6 +79,36 @@ def test_images_get_their_stamps(write, name, table):
     assert np.abs(np.array([t for t, _ in found]) - stamps).max() < 1000  # seconds in double precision
 
 
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        (lambda i, t: f"frame_{i + 1}", lambda i, t: "frame,timestamp\n" * (not i) + f"{i + 1},{t}"),
+        (lambda i, t: f"img{i:04d}", lambda i, t: f"img{i:04d}.png {t // 10**9}.{t % 10**9:09d}"),
+        (lambda i, t: f"{i:06d}", lambda i, t: f"{i};{t}"),
+    ],
+)
+def test_lines_of_images_that_are_not_there_are_passed_over(write, name, line):
+    folder, stamps = write(name, ("mav0/cam0/timestamps.csv", line))
+    images = sorted((folder / "mav0/cam0/data").iterdir())
+    for path in (images[0], images[5]):
+        path.unlink()
+    left = [int(path.stem.strip("_aefgimr")) - (path.stem[:5] == "frame") for path in images if path.exists()]
+    assert [level for _, level in levels(open_recording(folder))] == sorted(left)
+    assert [t for t, _ in levels(open_recording(folder))] == [stamps[i] for i in sorted(left)]
+
+
+def test_images_may_be_in_folders_inside_but_not_those_of_two_cameras(write):
+    folder, stamps = write(lambda i, t: f"{t}")
+    images = sorted((folder / "mav0/cam0/data").iterdir())
+    for k, path in enumerate(images):
+        place = folder / f"mav0/cam0/part{k // 5}"
+        place.mkdir(exist_ok=True)
+        path.rename(place / path.name)
+    assert levels(open_recording(folder)) == list(zip(stamps, range(COUNT), strict=True))
+    (folder / "mav0/cam0/part0" / images[7].name).write_bytes(b"the same name")
+    assert not open_recording(folder).cameras
+
+
 def test_a_list_of_another_length_is_not_used(write):
     folder, _ = write(lambda i, t: f"{i}", ("mav0/cam0/times.txt", lambda i, t: f"{t}\n{t + 1}"))
     recording = open_recording(folder)

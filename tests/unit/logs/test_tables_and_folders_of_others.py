@@ -87,6 +87,8 @@ def test_a_copy_in_the_folder_is_named(asl_folder, tmp_path):
         (["run1/mav0/x", "run2/a.bag"], "found recordings in it: give one of run1, run2"),
         (["img/0.png", "imu.txt"], r"found images in img/, tables imu\.txt$"),
         (["movie.MP4", "gyro.csv"], r"imu0\.csv and a video; found tables gyro\.csv, videos movie\.MP4$"),
+        (["0.png", "imu0.csv"], r"found images in the folder itself"),
+        (["cam0.zip", "imu0.csv"], r"found cam0\.zip \(unpack: unzip cam0\.zip\)"),
         (["movie.h264", "imu0.csv"], r"found movie\.h264 \(without stamps that can be read: convert it"),
         (["left/data/0.jpg", "imu0.csv"], r"cam0, cam1 \.\.\.; found images in left/data/"),
         (["cam0/1600000000000000000.png", "imu0.txt"], r"no IMU data: .* images in cam0/, tables imu0\.txt"),
