@@ -37,7 +37,7 @@ Exit codes:
   0   done
   1   a known failure, with one line on stderr
   2   wrong usage or config
-  3   done, but the calibration is not `converged`, or a recording of `merge` disagrees
+  3   done, but not `converged`; `merge`: a recording disagrees
   4   `verify`, `compare`: changed
   5   `verify`: cannot tell; `compare`: not comparable
 """

@@ -143,7 +143,8 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
 
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
     cameras, imus = named(args.camera), named(args.imu)
-    recordings = [open_recording(path, cameras=cameras, imus=imus) for path in args.inputs]
+    used: dict[str, Any] = {"skip_s": args.skip, "seconds": args.seconds}
+    recordings = [open_recording(path, cameras=cameras, imus=imus, **used) for path in args.inputs]
     for warning in (text for recording in recordings for text in recording.warnings):
         warn(warning)
     job = make_job(

@@ -16,6 +16,7 @@ from vical_daemon.cli.options import RECORDING, add_json, add_sensors, add_stret
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
+    from vical_daemon.logs import Recording
     from vical_daemon.results.change_odds import Counts
     from vical_daemon.results.export import Rig
     from vical_daemon.results.known import KnownCamera
@@ -86,7 +87,6 @@ def run(args: argparse.Namespace) -> int:
     counts = _counts(args)
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
-    from vical_daemon.logs import open_recording
     from vical_daemon.offline.calibrate import run_job
     from vical_daemon.offline.calibration_job import make_job
     from vical_daemon.offline.camera_names import by_recording
@@ -100,9 +100,7 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))
-    recording = open_recording(args.input, cameras=named(args.camera), imus=named(args.imu))
-    for warning in recording.warnings:
-        warn(warning)
+    recording = _opened(args)
     topics = {name: camera.topic for name, camera in known.items()}
     known = by_recording(known, topics, recording.cameras)
     initial = _initial(args, known, rig)
@@ -138,6 +136,22 @@ def run(args: argparse.Namespace) -> int:
 
         print(describe(document, Path(args.against).name))
     return {"holds": 0, "changed": EXIT_CHANGED}.get(document["verdict"], EXIT_CANNOT_TELL)
+
+
+def _opened(args: argparse.Namespace) -> Recording:
+    """Open the recording, and print what is unusual."""
+    from vical_daemon.logs import open_recording
+
+    recording = open_recording(
+        args.input,
+        cameras=named(args.camera),
+        imus=named(args.imu),
+        skip_s=args.skip,
+        seconds=args.seconds,
+    )
+    for warning in recording.warnings:
+        warn(warning)
+    return recording
 
 
 def _verifier(

@@ -18,7 +18,7 @@ from vical_daemon.logs.asl import AslRecording
 from vical_daemon.logs.asl_tables import is_table
 from vical_daemon.logs.asl_video import VIDEO_SUFFIXES
 from vical_daemon.logs.bags import BagRecording, is_bag
-from vical_daemon.logs.checks import check_camera, check_imu
+from vical_daemon.logs.checks import Part, check_camera, check_imu
 from vical_daemon.logs.mcap import segments_in
 from vical_daemon.logs.model import Kind, Recording, RecordingError, Stream, meant
 from vical_daemon.logs.recorded_logs import McapRecording
@@ -51,6 +51,8 @@ def open_recording(
     imus: Collection[str] = (),
     check: bool = True,
     as_recorded: bool = False,
+    skip_s: float = 0.0,
+    seconds: float | None = None,
 ) -> Recording:
     """Open a recording of any kind.
 
@@ -64,6 +66,8 @@ def open_recording(
             put on the even grid of their device (`even_stamps`, `even_images`), with a warning.
         check: Refuse wrong units, rates and clocks, and leave out sensors that are not meant
             (`check_recording`).
+        skip_s: Of the IMU only what comes so much later is checked, s; the rest is not used.
+        seconds: And only so much of it, s; None: all.
 
     Raises:
         RecordingError: It cannot be used; the message is one line with a remedy.
@@ -75,12 +79,16 @@ def open_recording(
         raise RecordingError(f"{path} does not exist; check the path")
     recording = _open(path, topics, cameras, as_recorded)
     if check:
-        recording.streams = check_recording(recording, cameras, imus)
+        recording.streams = check_recording(recording, cameras, imus, skip_s, seconds)
     return recording
 
 
 def check_recording(
-    recording: Recording, cameras: Collection[str] = (), imus: Collection[str] = ()
+    recording: Recording,
+    cameras: Collection[str] = (),
+    imus: Collection[str] = (),
+    skip_s: float = 0.0,
+    seconds: float | None = None,
 ) -> tuple[Stream, ...]:
     """Check units, rates and overlap; adds to `recording.warnings`.
 
@@ -88,6 +96,8 @@ def check_recording(
         recording: What to check.
         cameras: Those that are meant, where there is one of them; otherwise all.
         imus: The same for imus.
+        skip_s: See `open_recording`.
+        seconds: See `open_recording`.
 
     Returns:
         The streams to use: those that are meant. Of all, those that are not fit are left out with a warning
@@ -104,10 +114,12 @@ def check_recording(
         found = f"found only {sources}{unread}{expected}{there}"
         raise RecordingError(f"{recording.path} holds no IMU data: {found}")
 
+    part = Part(recording.begin_ns, skip_s, seconds)
+
     def imu(stream: Stream) -> list[str]:
         name = stream.name
         samples = recording.imu_arrays(name)
-        found = check_imu(name, samples, recording.set_back_s.get(name, 0.0))
+        found = check_imu(name, samples, recording.set_back.get(name), part)
         if len(recording.imus) > 1 and not samples.gyro_rps.any():  # it takes no other's place
             raise RecordingError(found[0])
         return found
@@ -135,7 +147,7 @@ def unfit_imus(recording: Recording) -> list[str]:
     found = []
     for name in recording.imus:
         try:
-            check_imu(name, recording.imu_arrays(name), recording.set_back_s.get(name, 0.0))
+            check_imu(name, recording.imu_arrays(name), recording.set_back.get(name))
         except RecordingError as error:
             found.append(f"not fit for calibration: {error}")
     return found

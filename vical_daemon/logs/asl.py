@@ -38,7 +38,7 @@ from vical_daemon.logs.model import (
     stream_statistics,
 )
 from vical_daemon.logs.stamp_column import StampColumn, column_ns, counter_ns
-from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back_s
+from vical_daemon.logs.stamps import StampError, not_a_stamp, numbers, set_back
 from vical_daemon.logs.table_text import FIRST_ROW, titles
 from vical_daemon.logs.titled_columns import (
     IN_DEGREES,
@@ -111,7 +111,7 @@ class AslRecording(Recording):
         self.rig = RIG
         self.warnings = []
         self.stamp_sigma_s = {}
-        self.set_back_s = {}
+        self.set_back = {}
         self.added_ns: dict[str, int] = {}
         self.unplaced: set[str] = set()
         self._as_recorded = as_recorded
@@ -362,8 +362,8 @@ class AslRecording(Recording):
             text_ = not_a_stamp(str(rows["t"][error.index]))
             raise RecordingError(f"{path}: row {error.index + 1} of the data: {text_}") from None
         self._note_stamps(sensor, column.sigma_s, column.report)
-        if back_s := set_back_s(column.t_ns):
-            self.set_back_s[sensor] = back_s
+        if back := set_back(column.t_ns):
+            self.set_back[sensor] = back
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
             _refuse_lost_digits(path, rows["t"], column)
         out = np.empty(len(rows), dtype)
@@ -429,7 +429,7 @@ class AslRecording(Recording):
             rows = rows[np.argsort(rows["t"], kind="stable")]
         if drop_equal and len(rows):
             fresh = np.append(True, np.diff(rows["t"]) > 0)
-            many = fresh.mean() < _MOST_FRESH and name not in self.set_back_s
+            many = fresh.mean() < _MOST_FRESH and name not in self.set_back
             if many and take_turns(rows["values"][:, :3], rows["values"][:, 3:]):
                 raise RecordingError(
                     f"{name}: {int((~fresh).sum())} rows repeat the stamp of another with other readings, "

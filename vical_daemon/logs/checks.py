@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vical_daemon.estimation.inertial.units import (
@@ -25,26 +27,56 @@ recordings of one."""
 _PAUSE_S = 86_400.0
 """Longest pause within a recording, s: over a day the drift of the clocks is followed (EuRoC with such a
 hole, by hand). Over months its sigma grows until no image fits."""
+_FEWEST = 20  # readings: nothing can be calibrated from less
+_NEVER_NS = 2**62  # behind any stamp
 _FEW = 0.05  # share of the readings that may lie beyond a longer one, as in `stamps.main_stretch`
 _AT_ONCE = 100_000  # readings that are looked at together: memory
 _COPY = "is one of the files a copy of another?"
 
 
-def check_imu(name: str, samples: ImuArrays, set_back_s: float = 0.0) -> list[str]:
+class Part(NamedTuple):
+    """Which part of a recording is used: `seconds` (None: all) from `skip_s` behind its first stamp on."""
+
+    first_ns: int
+    skip_s: float = 0.0
+    seconds: float | None = None
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp that are used."""
+        begin_ns = self.first_ns + round(self.skip_s * 1e9)
+        return begin_ns, _NEVER_NS if self.seconds is None else begin_ns + round(self.seconds * 1e9)
+
+    def of(self, samples: ImuArrays) -> ImuArrays:
+        """Return the readings in it; all where there are too few for a check."""
+        begin_ns, end_ns = self.span_ns
+        inside = (samples.t_ns >= begin_ns) & (samples.t_ns <= end_ns)
+        if np.count_nonzero(inside) < _FEWEST or inside.all():
+            return samples
+        force = samples.specific_force_mps2[inside]
+        return ImuArrays(samples.t_ns[inside], samples.gyro_rps[inside], force)
+
+
+def check_imu(
+    name: str, samples: ImuArrays, set_back: tuple[int, int] | None = None, part: Part | None = None
+) -> list[str]:
     """Return warnings about an imu stream.
 
     Args:
         name: Of the imu.
         samples: Its readings, in order of their stamps.
-        set_back_s: By how much its clock was set back during the recording, s.
+        set_back: See `Recording.set_back`.
+        part: Only this is used, and checked; None: all.
 
     Raises:
         RecordingError: Its rate or its units are implausible.
     """
-    if len(samples.t_ns) < 20:
+    part = part or Part(int(samples.t_ns[0]) if len(samples.t_ns) else 0)
+    samples = part.of(samples)
+    if len(samples.t_ns) < _FEWEST:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
     rate_hz = _check_imu_rate(name, samples.t_ns)
-    _check_clock_set(name, samples.t_ns, set_back_s)
+    _check_clock_set(name, samples.t_ns, set_back, part)
     _check_one_device(name, samples)
     if mistake := unit_mistake(samples):
         raise RecordingError(f"{name}: {mistake}")
@@ -75,19 +107,28 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     return rate_hz
 
 
-def _check_clock_set(name: str, t_ns: IntArray, set_back_s: float) -> None:
-    """Refuse readings during which the clock of the computer was set, by NTP or GPS."""
+def _check_clock_set(name: str, t_ns: IntArray, set_back: tuple[int, int] | None, part: Part) -> None:
+    """Refuse readings during which the clock of the computer was set, by NTP or GPS.
+
+    Stamps between those from and to which it was set back come twice, and cannot be put in order.
+    """
     ahead_s = np.diff(t_ns) * 1e-9
     at = int(np.argmax(ahead_s)) + 1
-    if set_back_s:
-        step = f"go back by {set_back_s:.3g} s"
+    begin_ns, end_ns = part.span_ns
+    if set_back is not None and begin_ns <= set_back[1] and set_back[0] <= end_ns:
+        low_ns, high_ns = set_back
+        step = f"go back by {(high_ns - low_ns) * 1e-9:.3g} s"
     elif ahead_s[at - 1] > _PAUSE_S and min(at, len(t_ns) - at) > _FEW * len(t_ns):
+        low_ns, high_ns = int(t_ns[at - 1]), int(t_ns[at])
         step = f"jump by {ahead_s[at - 1] / 86_400.0:.0f} days"
     else:
         return
+    before_s, after_s = (1e-9 * (t - part.first_ns) for t in (low_ns, high_ns))
+    use = [f"--seconds {before_s - 1.0:.0f}"] if before_s > 2.0 else []
+    use += [f"--skip {after_s + 1.0:.0f}"] if part.skip_s < after_s else []
     raise RecordingError(
         f"{name}: its stamps {step} in the middle: its clock was set, or these are two recordings; give the "
-        "data before and after it as two recordings"
+        f"data before and after it as two recordings, or use only a part ({' or '.join(use)})"
     )
 
 

@@ -91,7 +91,7 @@ class Recording(ABC):
         warnings: Problems, one line each.
         stamp_sigma_s: By how much the stamps of a sensor may be off together, s: of those that were put on an
             even grid, or are written in coarse steps.
-        set_back_s: By how much the clock of a sensor was set back during the recording, s.
+        set_back: Of a sensor whose clock was set back during the recording: to which stamp, from which, ns.
         added_ns: Cameras whose stamps count from their own zero (videos), and what was added to them, ns.
         unplaced: Those of them that begin at an unknown time. Until it is found, they begin with the IMU.
     """
@@ -101,7 +101,7 @@ class Recording(ABC):
     streams: tuple[Stream, ...]
     warnings: list[str]
     stamp_sigma_s: dict[str, float]
-    set_back_s: dict[str, float]
+    set_back: dict[str, tuple[int, int]]
     added_ns: Mapping[str, int] = MappingProxyType({})
     unplaced: AbstractSet[str] = frozenset()
 

@@ -42,7 +42,7 @@ from vical_daemon.logs.model import (
 )
 from vical_daemon.logs.ros1_bag import ros2_type, to_cdr
 from vical_daemon.logs.stamp_column import coarseness
-from vical_daemon.logs.stamps import set_back_s
+from vical_daemon.logs.stamps import set_back
 from vical_daemon.logs.united_imu import forces_at, lacks
 
 _KIND_OF_TYPE: dict[str, Kind] = {
@@ -128,7 +128,7 @@ class LogRecording(Recording):
         self.rig = _RIG
         self.warnings = []
         self.stamp_sigma_s = {}
-        self.set_back_s = {}
+        self.set_back = {}
         self._scanned = False
         self._wanted = None if topics is None else set(topics)
         self._channels: dict[str, Channel] = {}
@@ -183,8 +183,8 @@ class LogRecording(Recording):
         self._leave_depth_out()
         for channel in self._channels.values():
             channel.leave_out_strays()
-            if back_s := set_back_s(channel.t_ns()):
-                self.set_back_s[channel.name] = back_s
+            if back := set_back(channel.t_ns()):
+                self.set_back[channel.name] = back
             if channel.strays:
                 count = f"{channel.strays} of {channel.strays + len(channel.stamps)} messages"
                 self.warnings.append(f"{channel.name}: {count} left out: stamps far from all others, or 0")

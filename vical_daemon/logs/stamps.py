@@ -216,21 +216,24 @@ def main_stretch(t_ns: IntArray) -> tuple[int, int] | None:
     return int(ordered[begin]), int(ordered[begin + int(lengths[largest]) - 1])
 
 
-def set_back_s(t_ns: IntArray) -> float:
-    """Return by how much a clock was set back while it stamped these messages, in the order of the log, s.
+def set_back(t_ns: IntArray) -> tuple[int, int] | None:
+    """Return from which stamp to which a clock was set back while it stamped these messages, ns: (to, from).
 
-    0: it was not. Some messages of another order, or with wrong stamps, do not count, and neither do copies.
+    None: it was not. Some messages of another order, or with wrong stamps, do not count, nor do copies.
 
-    >>> set_back_s(np.array([*range(20), *range(-5, 15)]) * 10**9)
-    20.0
-    >>> set_back_s(np.array([*range(20), 10**6, *range(21, 40)]) * 10**9)
-    0.0
+    Args:
+        t_ns: In the order of the log, shape (n,).
+
+    >>> set_back(np.array([*range(20), *range(-5, 15)]) * 10**9)
+    (-5000000000, 19000000000)
+    >>> set_back(np.array([*range(20), 10**6, *range(21, 40)]) * 10**9)
     """
     if len(t_ns) < 2 * _NEIGHBOURS:
-        return 0.0
+        return None
     at = int(np.argmin(np.diff(t_ns))) + 1
     if t_ns[at] == t_ns[0]:
-        return 0.0  # a copy
+        return None  # a copy
     before, after = t_ns[max(at - _NEIGHBOURS, 0) : at], t_ns[at : at + _NEIGHBOURS]
     back_s = float(np.median(before) - np.median(after)) * 1e-9
-    return back_s if min(len(before), len(after)) == _NEIGHBOURS and back_s > _BACK_S else 0.0
+    sure = min(len(before), len(after)) == _NEIGHBOURS and back_s > _BACK_S
+    return (int(after.min()), int(before.max())) if sure else None

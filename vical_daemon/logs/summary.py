@@ -133,7 +133,8 @@ def summarise_recording(recording: Recording) -> Summary:
 
 def _source(recording: Path, source: str) -> str:
     """Name a topic as the recording does, and a file by its place in the folder."""
-    return str(Path(source).relative_to(recording)) if Path(source).is_relative_to(recording) else source
+    place = recording if recording.is_dir() else recording.parent
+    return str(Path(source).relative_to(place)) if Path(source).is_relative_to(place) else source
 
 
 def _fit(value: int) -> int:

@@ -96,7 +96,7 @@ def _readings(recording: Recording, imu: str | None) -> ImuArrays:
     """Return the readings of the imu that is meant, whose units and rate are plausible."""
     name, _, _ = choose_gyro(recording, imu)
     readings = recording.imu_arrays(name)
-    check_imu(name, readings, recording.set_back_s.get(name, 0.0))
+    check_imu(name, readings, recording.set_back.get(name))
     return readings
 
 

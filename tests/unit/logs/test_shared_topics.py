@@ -16,8 +16,11 @@ from vical_daemon.bus.messages import (
     encode_image,
     encode_imu,
 )
+from vical_daemon.config.priors import Initial
+from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.channel import stamp_of, with_stamp
+from vical_daemon.offline.calibration_job import make_job
 
 TURNED = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # another mounting
 
@@ -179,6 +182,31 @@ def test_a_table_whose_clock_was_set_back_is_named(tmp_path, a_motion, write_asl
     t_ns = t_ns - 5 * 10**9 * (np.arange(len(t_ns)) > 1200)
     with pytest.raises(RecordingError, match=r"imu0: its stamps go back by (4\.9\d|5) s"):
         open_recording(write_asl(tmp_path / "a", imu=(t_ns, gyro, force)))
+
+
+@pytest.mark.parametrize(("used", "late_s"), [((0.0, 2.0), 0.0), ((7.5, None), 1.5)])
+def test_what_is_before_or_after_a_step_of_the_clock_can_be_used(a_motion, write_asl, tmp_path, used, late_s):
+    """Between, each stamp comes twice; `--skip` and `--seconds` could not leave that out."""
+    t_ns, gyro, force = a_motion()
+    after = np.arange(len(t_ns)) > 1200
+    folder = write_asl(tmp_path / "a", imu=(t_ns - 1_500_000_000 * after, gyro, force))
+    with pytest.raises(RecordingError, match=r"two recordings, or use only a part .--seconds 4 or --skip 7."):
+        open_recording(folder)
+    skip_s, seconds = used
+    with pytest.raises(RecordingError, match=r"go back by 1\.5 s"):
+        open_recording(folder, skip_s=max(skip_s - 2.0, 0.0), seconds=None)
+    job = make_job(
+        open_recording(folder, skip_s=skip_s, seconds=seconds),
+        Initial({"cam0": CameraPrior(resolution=(752, 480))}),
+        target=None,
+        skip_s=skip_s,
+        seconds=seconds,
+    )
+    found = [decode_imu(payload) for key, payload in job.messages() if key == job.imu.key]
+    begin_ns = t_ns[0] + round((skip_s + late_s) * 1e9)
+    inside = (t_ns >= begin_ns) & (t_ns <= begin_ns + (seconds or 60.0) * 1e9)
+    assert [m.stamp_ns for m in found] == (t_ns[inside] - round(late_s * 1e9)).tolist()
+    assert [list(m.gyro_rps) for m in found] == gyro[inside].tolist()
 
 
 @pytest.mark.parametrize("share", [0.4, 0.01])
