@@ -197,7 +197,7 @@ def test_what_is_before_or_after_a_step_of_the_clock_can_be_used(a_motion, write
         open_recording(folder, skip_s=max(skip_s - 2.0, 0.0), seconds=None)
     job = make_job(
         open_recording(folder, skip_s=skip_s, seconds=seconds),
-        Initial({"cam0": CameraPrior(resolution=(752, 480))}),
+        Initial({"cam0": CameraPrior(resolution=(752, 752))}),
         target=None,
         skip_s=skip_s,
         seconds=seconds,
