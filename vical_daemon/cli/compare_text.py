@@ -39,7 +39,7 @@ def _camera(camera: CameraComparison, *, with_map: bool) -> list[str]:
     ]
     if apart.common_s > 1.0:
         lines.append(f"  {apart.common_s:.0f} s of data are in both, and counted once")
-    lines += ["", f"  {'':<14}{'B minus A':>12}{'sigma':>11}{'z':>8}"]
+    lines += ["", f"  {'':<14}{'B minus A':>12}{'sigma':>11}{'z':>13}"]
     lines += _rows(apart)
     if apart.unlike_px > 0.0:
         lines.append(
@@ -62,9 +62,7 @@ def _rows(apart: Difference) -> list[str]:
             z = apart.d[k] / apart.sigma[k]
             left_open = "  within 2 sigma" if abs(z) < _OPEN_Z else ""
             name = f"{block} {label}".strip()
-            lines.append(
-                f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}".rstrip()
-            )
+            lines.append(f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f} {unit:<4}{z:>8.1f}{left_open}")
     return lines
 
 
@@ -126,6 +124,6 @@ def _imu(d: FloatArray, sigma: FloatArray) -> list[str]:
     for k, (name, axis) in enumerate((n, axis) for n in ("gyro bias", "accel. bias") for axis in "xyz"):
         unit = "rad/s" if k < 3 else "m/s^2"
         lines.append(
-            f"  {name + ' ' + axis:<14}{d[k]:>+12.5f}{sigma[k]:>11.5f}{d[k] / sigma[k]:>8.1f} {unit}"
+            f"  {name + ' ' + axis:<14}{d[k]:>+12.5f}{sigma[k]:>11.5f} {unit:<5}{d[k] / sigma[k]:>7.1f}"
         )
     return lines

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, warn
+from vical_daemon.cli.options import RECORDING, add_json, warn
 
 if TYPE_CHECKING:
     from vical_daemon.offline.td_icp.request import TdIcpRequest
@@ -28,9 +28,7 @@ The sign is Kalibr's: t_imu = t_cam + shift.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a trajectory file"
-    )
+    parser.add_argument("input", metavar="INPUT", help=f"{RECORDING}; or a trajectory file")
     parser.add_argument("more", metavar="SENSOR", nargs="*", help="further sensors, as with --sensors")
     parser.add_argument(
         "--target",

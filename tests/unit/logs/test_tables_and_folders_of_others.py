@@ -12,6 +12,7 @@ from vical_daemon.config.priors import Initial
 from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.summary import summarise_recording
 from vical_daemon.offline.calibration_job import make_job
 from vical_daemon.offline.errors import InputError
 
@@ -117,3 +118,9 @@ def test_a_video_is_no_recording(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"x")
     with pytest.raises(RecordingError, match=r"a\.mp4 is a video: give the folder that holds it and a table"):
         open_recording(tmp_path / "a.mp4")
+
+
+def test_a_table_alone_is_listed_by_its_name(asl_folder):
+    """`vical info` had called it "."."""
+    summary = summarise_recording(open_recording(asl_folder / "mav0/imu0/data.csv"))
+    assert [topic.topic for topic in summary.topics] == ["data.csv"]

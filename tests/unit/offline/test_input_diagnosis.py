@@ -92,3 +92,14 @@ def test_another_board_is_named_although_few_images_show_it(tmp_path, write_asl,
     job = make_job(open_recording(tmp_path / "a.mcap"), Initial(), target=str(tmp_path / "target.yaml"))
     found = diagnose_input(job)
     assert says in found and bool(found.count("in view")) == bool(says)
+
+
+def test_points_of_another_board_are_named(folder, tmp_path):
+    """A log may hold points that were found with another target file."""
+    other = tmp_path / "other.yaml"
+    other.write_text("target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n")
+    prior = CameraPrior(resolution=RIG.lens.resolution)
+    job = make_job(open_recording(folder), Initial({"cam0": prior}), target=str(other))
+    assert re.match(
+        r"cam0: the points in its \d+ images fit no pose of the board in .*/other.yaml", diagnose_input(job)
+    )

@@ -136,7 +136,14 @@ def board_poses(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
     fit = estimate_intrinsics(lens, frames, points_m, _LENS_VIEWS)
-    return target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.distortion_model), fit
+    found = target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.distortion_model)
+    if not len(found.t_cam_ns):
+        count = sum(len(f.ids) > 0 for f in frames)
+        raise InputError(
+            f"{stream.name}: the points in its {count} images fit no pose of the board in {target}; is it "
+            "another board?"
+        )
+    return found, fit
 
 
 def lens_of(stream: Stream, prior: CameraPrior | None) -> CameraState:
