@@ -324,7 +324,8 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
         camera["resolution"] = list(job.priors[name].resolution)
         if job.cameras[name].topic:
             camera["topic"] = job.cameras[name].topic
-        if (added_ns := job.recording.added_ns.get(job.cameras[name].name)) is not None:
+        added_ns = job.recording.added_ns.get(job.cameras[name].name)
+        if added_ns is not None and not outcome.inputs:  # of several recordings each has its own
             camera["added_to_stamps_s"] = added_ns * 1e-9
     if result["imu"] is not None:
         result["imu"] |= {"name": job.imu.name, "noise": asdict(noise_of(job))}
