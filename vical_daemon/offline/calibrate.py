@@ -162,6 +162,24 @@ def _place(job: Job) -> None:
             place = part.recording, part.imu.name, stream, prior, target
             part.cameras[name] = placed(*place, job.warn)
             job.common_clock = False
+        _check_images(part)
+
+
+def _check_images(part: Job) -> None:
+    """Refuse a part of a recording without images: nothing would be seen, and the motion be blamed.
+
+    Raises:
+        OptionError: There are none between --skip and --seconds.
+    """
+    seen = [(stream.begin_ns, stream.end_ns) for stream in part.cameras.values()]
+    if any(begin_ns <= part.end_ns and end_ns >= part.begin_ns for begin_ns, end_ns in seen):
+        return
+    zero_ns = part.recording.begin_ns
+    begin_s, end_s = ((t - zero_ns) * 1e-9 for t in (min(s[0] for s in seen), max(s[1] for s in seen)))
+    raise OptionError(
+        f"{part.recording.path}: the part that --skip and --seconds name has no images; they are from "
+        f"{begin_s:.1f} to {end_s:.1f} s"
+    )
 
 
 class _Player:

@@ -107,6 +107,14 @@ def test_a_given_time_shift_says_nothing_about_a_video(before_a_board):
         run_job(job, lambda *_: None)
 
 
+def test_a_part_without_images_is_named(before_a_board):
+    folder, _, _ = before_a_board
+    target = str(folder / "board.yaml")
+    job = make_job(open_recording(folder), Initial(), target=target, seconds=30.0)
+    with pytest.raises(OptionError, match=r"has no images; they are from 97\.2 to 111\.\d s"):
+        run_job(job, lambda *_: None)
+
+
 def test_without_a_board_features_show_when_a_video_begins(tmp_path):
     rig = reference_rig(11, lens=SMALL)
     folder, zero_s = recorded(
