@@ -48,7 +48,7 @@ def placed(
         The camera with its new stamps.
 
     Raises:
-        InputError: The rotations show no place, or several.
+        InputError: The rotations show no place.
     """
     if stream.name not in recording.unplaced:
         return stream
