@@ -36,6 +36,7 @@ from vical_daemon.estimation.filter.linearise import (
     by_derivatives,
     by_sigma_points,
     is_rolling,
+    move_rows_by_noise,
     view_derivatives,
 )
 from vical_daemon.estimation.filter.passed import Corrected, Moved
@@ -274,6 +275,9 @@ class CalibrationFilter:
             if shared.jitter_s or shared.shift_px:
                 lin.shared = lin.by_shared * shared.sigmas
             bend_by_jitter(lin, self.state, self.layout, self.rates, image, shared.jitter_s)
+        if is_rolling(self.state, self.layout, image.camera):
+            density = self.imu_noise.gyro_density
+            move_rows_by_noise(lin, self.state, self.layout, self.rates, image, density)
         return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:

@@ -165,12 +165,49 @@ def bend_by_jitter(
     bent = 0.5 * (uv[1] + uv[2]) - uv[0]
     bent = np.where(lin.valid[:, None] & np.isfinite(bent), bent, 0.0)
     lin.z = lin.z + bent
-    # one way more, that no error of the state moves: the variance of a square is twice its squared mean
-    lin.ways = np.concatenate([lin.ways, math.sqrt(2.0) * bent.reshape(-1, 1)], axis=1)
+    # the variance of a square is twice its squared mean
+    _move_more(lin, math.sqrt(2.0) * bent.reshape(-1, 1))
+
+
+def _move_more(lin: Linear, ways: FloatArray) -> None:
+    """Ways more in which noise of unit variance moves the image, and no error of the state; shape (2n, r)."""
+    r = ways.shape[1]
+    lin.ways = np.concatenate([lin.ways, ways], axis=1)
     lin.by_error, lin.spread, lin.by_shared = (
-        np.concatenate([x, np.zeros((1, x.shape[1]))]) for x in (lin.by_error, lin.spread, lin.by_shared)
+        np.concatenate([x, np.zeros((r, x.shape[1]))]) for x in (lin.by_error, lin.spread, lin.by_shared)
     )
-    lin.shared = block_diag(lin.shared, np.ones((1, 1)))
+    lin.shared = block_diag(lin.shared, unscented.unit(r))
+
+
+def move_rows_by_noise(
+    lin: Linear, state: State, layout: Layout, rates: Rates, image: Image, gyro_density: float
+) -> None:
+    """Add to the covariance of an image what the gyro's noise turns its rows by, in place."""
+    ways = rows_by_noise(state, layout, rates, image, gyro_density)
+    if ways.size:
+        _move_more(lin, np.where(np.repeat(lin.valid, 2)[:, None], ways, 0.0))
+
+
+def rows_by_noise(
+    state: State, layout: Layout, rates: Rates, image: Image, gyro_density: float
+) -> FloatArray:
+    """How the gyro's noise during the readout moves the pixels; of unit variance, shape (2n, 6).
+
+    Rows are placed by the gyro. From the middle row to the last its noise adds up to a turn of `gyro_density`
+    times the root of half the readout, about each axis, and independently from the middle one back to the
+    first. Global shutters: shape (2n, 0).
+    """
+    known = state.cameras[image.camera]
+    half_s = 0.5 * abs(known.readout_s)
+    if half_s == 0.0:
+        return np.zeros((2 * len(image.points), 0))
+    at = (image.camera, image.t_cam_s, image.points, image.uv, np.zeros((1, layout.size)))
+    off = gyro_density / math.sqrt(half_s)  # rad/s
+    turned = [rates._replace(omega=rates.omega + off * axis) for axis in unscented.unit(3)]
+    uv = np.array([project_errors(state, layout, each, *at)[0] for each in [rates, *turned]])
+    moved = np.nan_to_num((uv[1:] - uv[0]).reshape(3, -1).T, posinf=0.0, neginf=0.0)
+    late = np.repeat(read_share(image.uv, known.resolution, known.readout_axis) > 0.0, 2)[:, None]
+    return np.concatenate([moved * late, moved * ~late], axis=1)
 
 
 def is_rolling(state: State, layout: Layout, camera: str) -> bool:

@@ -19,7 +19,13 @@ from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_update import POSE_DOF
-from vical_daemon.estimation.filter.linearise import Image, by_small_steps, is_rolling, view_derivatives
+from vical_daemon.estimation.filter.linearise import (
+    Image,
+    by_small_steps,
+    is_rolling,
+    rows_by_noise,
+    view_derivatives,
+)
 from vical_daemon.estimation.filter.linearised_filter import Instant, LinearisedFilter, Reference
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
@@ -73,6 +79,7 @@ class View(NamedTuple):
         ways: See `Linear`, shape (2n, k).
         by_error: See `Linear`, shape (k, size).
         by_shared: The ways by one unit of each of the errors that corners share, see `shared_ways`, (k, 3).
+        by_rows: See `rows_by_noise`, shape (2n, r).
     """
 
     node: int
@@ -83,6 +90,7 @@ class View(NamedTuple):
     ways: FloatArray
     by_error: FloatArray
     by_shared: FloatArray
+    by_rows: FloatArray
 
 
 class Whitened(NamedTuple):
@@ -336,7 +344,8 @@ class BoardWindow:
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
         by_shared = by_error @ shared_ways(state, self.layout, name)
-        return View(k, name, residual, relative, seen, ways, by_error, by_shared)
+        by_rows = rows_by_noise(state, self.layout, node.rates, image, self._noise.gyro_density)
+        return View(k, name, residual, relative, seen, ways, by_error, by_shared, by_rows)
 
     def _linked(self) -> tuple[FloatArray, FloatArray]:
         """See `Present`: missed, by_link."""
@@ -407,16 +416,18 @@ class BoardWindow:
 
     def _whitened(self, view: View, noise: float) -> Whitened:
         sigma, sigmas = self.sigma_px[view.camera] * noise * view.relative, self.shared.get(view.camera)
-        unit = view.by_shared[:, :0] if sigmas is None else view.by_shared * sigmas
+        unit = view.by_rows
+        if sigmas is not None:
+            unit = np.concatenate([view.ways @ (view.by_shared * sigmas), unit], axis=1)
         left = view.residual
         for _ in range(2 if unit.size else 1):
             far = np.vecdot(left, left) / sigma**2
             weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / SURE_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
             W, r = view.ways * twice[:, None], view.residual.ravel() * twice
-            A = W @ unit
+            A = unit * twice[:, None]
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
-            left = view.residual - (view.ways @ (unit @ shared)).reshape(-1, 2)
+            left = view.residual - (unit @ shared).reshape(-1, 2)
         far = np.vecdot(left, left) / sigma**2
         # what is lost from sight costs as much as a gross outlier
         cost = np.where(view.seen, far / (1.0 + far / SURE_SIGMAS**2), SURE_SIGMAS**2)

@@ -11,7 +11,9 @@ from vical_daemon.estimation.filter.linearise import (
     bend_by_jitter,
     by_derivatives,
     by_sigma_points,
+    move_rows_by_noise,
     project_errors,
+    rows_by_noise,
     view_derivatives,
 )
 from vical_daemon.estimation.filter.propagate import move_by_derivatives, move_by_sigma_points
@@ -210,3 +212,31 @@ def test_straightness_is_measured_again_when_a_sigma_grows_or_time_passes():
     assert sum(s.holds(sigmas) for _ in range(200)) < 100
     s.measured(sigmas, 0.5)
     assert not s.holds(sigmas)
+
+
+def test_rows_of_a_rolling_shutter_are_turned_by_the_noise_of_the_gyro():
+    """Against random walks of the attitude from the middle row to the first and the last."""
+    density, readout_s, draws = 5e-3, 0.02, 4000
+    state, layout, rates, image = scene("radtan", frozenset({"readout"}))
+    camera = replace(state.cameras["cam0"], readout_s=readout_s)
+    state = replace(state, cameras={"cam0": camera})
+    rolling = (state, layout, rates._replace(omega=np.zeros(3), accel=np.zeros(3)))
+    uv = np.array([[100.0, 0.0], [100.0, 480.0]])
+    # at the instant of the state
+    ends = replace(image, t_cam_s=0.996, ids=image.ids[:2], points=image.points[[0, 0]], uv=uv)
+    ends = replace(ends, sigma_px=image.sigma_px[:2])
+    ways = rows_by_noise(*rolling, ends, density)
+    turns = density * np.sqrt(readout_s / 2.0) * np.random.default_rng(5).standard_normal((2, draws, 3))
+    errors, walked, middle = np.zeros((draws, layout.size)), [], np.full((2, 2), 240.0)
+    for turn in turns:
+        errors[:, :3] = turn
+        walked.append(project_errors(*rolling, "cam0", 0.996, ends.points, middle, errors)[:, 0])
+    expected = np.cov(np.concatenate(walked, axis=1).T)
+    np.testing.assert_allclose(ways @ ways.T, expected, rtol=0.1, atol=0.02 * np.trace(expected))
+    lin = by_sigma_points(*rolling, ends, np.zeros(layout.size), np.diag(np.full(layout.size, 1e-5)))
+    more = replace(lin)
+    move_rows_by_noise(more, *rolling, ends, density)
+    before, after = (x.ways @ x.moves for x in (lin, more))
+    np.testing.assert_allclose(after @ after.T - before @ before.T, ways @ ways.T, atol=1e-9)
+    global_shutter = replace(state, cameras={"cam0": replace(camera, readout_s=0.0)})
+    assert rows_by_noise(global_shutter, layout, rates, ends, density).shape == (4, 0)
