@@ -201,12 +201,11 @@ def rows_by_noise(
     half_s = 0.5 * abs(known.readout_s)
     if half_s == 0.0:
         return np.zeros((2 * len(image.points), 0))
-    at = (image.camera, image.t_cam_s, image.points, image.uv, np.zeros((1, layout.size)))
-    off = gyro_density / math.sqrt(half_s)  # rad/s
-    turned = [rates._replace(omega=rates.omega + off * axis) for axis in unscented.unit(3)]
-    uv = np.array([project_errors(state, layout, each, *at)[0] for each in [rates, *turned]])
-    moved = np.nan_to_num((uv[1:] - uv[0]).reshape(3, -1).T, posinf=0.0, neginf=0.0)
-    late = np.repeat(read_share(image.uv, known.resolution, known.readout_axis) > 0.0, 2)[:, None]
+    by_turn = view_derivatives(state, layout, rates, image)[1][:, :3] @ known.R_imu_cam.T
+    late_s = known.readout_s * read_share(image.uv, known.resolution, known.readout_axis)
+    turned_rad = np.repeat(late_s, 2)[:, None] * (gyro_density / math.sqrt(half_s))
+    moved = np.nan_to_num(by_turn * turned_rad, posinf=0.0, neginf=0.0)
+    late = turned_rad > 0.0
     return np.concatenate([moved * late, moved * ~late], axis=1)
 
 
