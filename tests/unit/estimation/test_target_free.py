@@ -125,6 +125,16 @@ def test_starts_while_three_tenths_of_the_features_move(seed):
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
 
 
+@pytest.mark.parametrize(("seed", "rate_dps"), [(1, 8.0), (2, 10.0), (4, 10.0)])
+def test_starts_in_slow_motion(seed, rate_dps):
+    """A time shift known to 1 ms had been waited for, and windows had not settled along a curved valley."""
+    rig = reference_rig(seed, mean_rate_dps=rate_dps, timeshift_cam_imu_s=-0.03)
+    record = feed(run := simulate_tracks(seed, 12.0, rig=rig, camera_rate_hz=10.0), subject_for(run))
+    assert record.started_s() <= 10.0
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-3, 7), shot.t_s
+
+
 def test_a_window_far_from_settled_throws_no_good_observations_out():
     # a lens that nearly folds at the corners, roughly known: windows stop far from the truth with a quarter
     # of the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
