@@ -1,4 +1,4 @@
-"""Landmarks in a step of an adjustment: to first order as if anchors stayed, exact if all cameras move alike."""
+"""Landmarks in a step: to first order as if anchors stayed, exact if all cameras move alike."""
 
 import numpy as np
 
