@@ -88,7 +88,8 @@ def window_start(
     trial.agreement = {}  # what it says of the lens is not kept
     trial.shared = {name: old if (old := trial.shared[name]).images else new for name, new in shared.items()}
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
-    if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():
+    few = not trial.seen or 2 * sum(r.used for r in reports) < len(reports)
+    if few or not trial.plain().finite():
         return None
     out = window.filter(make(deepcopy(state)), trial.smoothed())
     out.corner_noise, out.shared, out.consistency = trial.corner_noise, trial.shared, trial.consistency
