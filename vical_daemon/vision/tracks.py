@@ -53,7 +53,7 @@ class TrackOptions:
     epipolar_px: float = 1.5
     fast_threshold: int = 18
     border_px: int = 8
-    sigma_floor_px: float = 0.15
+    sigma_floor_px: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -200,11 +200,12 @@ class FeatureTracker:
         """Pull each feature to where its first look matches; anchor anew where that no longer fits."""
         features = self._features
         features.warp = self.predictor.linear_flow() @ features.warp
-        uv, unlike, sigma = features.templates.align(smooth, features.uv, features.warp)
+        uv, warp, unlike, sigma = features.templates.align(smooth, features.uv, features.warp)
         fits = (np.linalg.norm(uv - features.uv, axis=1) < self.options.align_px) & (
             unlike < self.options.unlike
         )
         features.uv = np.where(fits[:, None], uv, features.uv)
+        features.warp = np.where(fits[:, None, None], warp, np.eye(2))
         features.sigma = np.where(fits, sigma, features.sigma)
         stale = np.flatnonzero(~fits)
         if len(stale):
@@ -212,7 +213,6 @@ class FeatureTracker:
             order = np.argsort(np.concatenate([np.flatnonzero(fits), stale]), kind="stable")
             fresh = Templates.cut(smooth, features.uv[stale])
             features.templates = kept.joined(fresh).take(order)
-            features.warp[stale] = np.eye(2)
             features.drift[stale] = np.hypot(features.drift[stale], self.options.sigma_floor_px)
 
     def _check_epipolar(self) -> None:
