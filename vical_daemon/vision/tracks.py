@@ -34,8 +34,8 @@ class TrackOptions:
         back_window_px: The same on the way back: with another window, a point on an edge slides elsewhere.
         levels: Pyramid levels above the picture at half the size.
         back_px: Largest distance of the way back from where it began.
-        align_px: Largest move of the alignment with a feature's first look before it is anchored anew.
-        unlike: Largest unlikeness (0 equal, 1 unrelated) before it is anchored anew.
+        align_px: Largest move of the alignment with a feature's first look; beyond, it is given up.
+        unlike: Largest unlikeness (0 equal, 1 unrelated); likewise.
         epipolar_px: Largest distance from the epipolar line.
         fast_threshold: Contrast of a new corner, grey levels.
         border_px: Features nearer to the edge are given up.
@@ -71,7 +71,6 @@ class _Features:
     ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    drift: FloatArray = field(default_factory=lambda: np.zeros(0))
     old_uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     warp: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
     templates: Templates = field(default_factory=no_templates)
@@ -79,7 +78,7 @@ class _Features:
     def keep(self, mask: BoolArray) -> None:
         """Drop the others."""
         self.ids, self.uv, self.sigma = self.ids[mask], self.uv[mask], self.sigma[mask]
-        self.drift, self.old_uv, self.warp = self.drift[mask], self.old_uv[mask], self.warp[mask]
+        self.old_uv, self.warp = self.old_uv[mask], self.warp[mask]
         self.templates = self.templates.take(mask)
 
     def add(self, ids: IntArray, uv: FloatArray, templates: Templates, sigma_px: float) -> None:
@@ -87,7 +86,6 @@ class _Features:
         count = len(ids)
         self.ids, self.uv = np.append(self.ids, ids), np.vstack([self.uv, uv])
         self.sigma = np.append(self.sigma, np.full(count, sigma_px))
-        self.drift = np.append(self.drift, np.zeros(count))
         self.old_uv = np.vstack([self.old_uv, np.full(uv.shape, np.nan)])
         self.warp = np.concatenate([self.warp, np.broadcast_to(np.eye(2), (count, 2, 2))])
         self.templates = self.templates.joined(templates)
@@ -144,7 +142,7 @@ class FeatureTracker:
         if not len(self._features.ids):
             return None
         features = self._features
-        sigma = np.sqrt(features.sigma**2 + features.drift**2 + self.options.sigma_floor_px**2)
+        sigma = np.hypot(features.sigma, self.options.sigma_floor_px)
         return Detection(features.ids.copy(), features.uv.copy(), sigma)
 
     def _follow(self, before: _Picture, now: _Picture, shape: tuple[int, int]) -> None:
@@ -197,23 +195,13 @@ class FeatureTracker:
         return np.where(good[:, None], uv, points), np.asarray(good)
 
     def _align(self, smooth: Float32) -> None:
-        """Pull each feature to where its first look matches; anchor anew where that no longer fits."""
+        """Pull each feature to where its first look matches; give up those that no longer look alike."""
         features = self._features
         features.warp = self.predictor.linear_flow() @ features.warp
         uv, warp, unlike, sigma = features.templates.align(smooth, features.uv, features.warp)
-        fits = (np.linalg.norm(uv - features.uv, axis=1) < self.options.align_px) & (
-            unlike < self.options.unlike
-        )
-        features.uv = np.where(fits[:, None], uv, features.uv)
-        features.warp = np.where(fits[:, None, None], warp, np.eye(2))
-        features.sigma = np.where(fits, sigma, features.sigma)
-        stale = np.flatnonzero(~fits)
-        if len(stale):
-            kept = features.templates.take(np.flatnonzero(fits))
-            order = np.argsort(np.concatenate([np.flatnonzero(fits), stale]), kind="stable")
-            fresh = Templates.cut(smooth, features.uv[stale])
-            features.templates = kept.joined(fresh).take(order)
-            features.drift[stale] = np.hypot(features.drift[stale], self.options.sigma_floor_px)
+        near = np.linalg.norm(uv - features.uv, axis=1) < self.options.align_px
+        features.uv, features.warp, features.sigma = uv, warp, sigma
+        features.keep(near & (unlike < self.options.unlike))
 
     def _check_epipolar(self) -> None:
         """Compare with the picture of `EPIPOLAR_EVERY` frames ago; drop what moved against the rest."""
