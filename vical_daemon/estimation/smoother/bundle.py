@@ -36,7 +36,7 @@ _BOUNDS = 0.2, 5.0  # of an inverse distance after a step, over that before it
 _ROUNDS = 4  # of looking for distances that a step would move beyond their bounds
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
-_LESS = 1.1  # of the noise of features, over what is measured at the end: then a window goes on
+_LESS = 1.1  # of the noise of features, over what is measured now: then a window goes on with that
 _MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
 """What a step changes of a window."""
 _MEMORY = 25  # images over which an error of the pixels may last
@@ -152,9 +152,10 @@ class Bundle:
             elif not now.cleaned:  # close enough to tell outliers
                 now.view = self._applied(step, now.view.seen)
                 self._learn_noise(now.view)
-                if self._refuse(now.view):
+                now.cleaned = not self._refuse(now.view)
+                if not now.cleaned:  # without many outliers the noise is less, and more of them show
                     now.view = self.problem.view(w.observe())
-                now.cleaned = True
+                    now.cleaned = not self._fits_better(now.view)
             else:
                 self._tried(now, step)
                 if self._suspects_offsets(now):
@@ -362,10 +363,10 @@ class Bundle:
         before = self.problem.noise
         self._learn_noise(view)
         now = self.problem.noise
-        if before.sigma_px * before.spread > _LESS * now.sigma_px * now.spread:
-            return True
-        self.problem.noise = before
-        return False
+        better = bool(before.sigma_px * before.spread > _LESS * now.sigma_px * now.spread)
+        if not better:
+            self.problem.noise = before
+        return better
 
     def _dof(self, seen: Seen) -> int:
         return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)
