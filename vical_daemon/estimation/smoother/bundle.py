@@ -37,8 +37,7 @@ _ROUNDS = 4  # of looking for distances that a step would move beyond their boun
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
 _LESS = 1.1  # of the noise of features, over what is measured now: then a window goes on with that
-_MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")
-"""What a step changes of a window."""
+_MOVED = ("R", "p", "v", "bias", "camera", "landmarks", "imu", "own_lens", "jumps")  # what a step changes
 _MEMORY = 25  # images over which an error of the pixels may last
 LEAST_PARALLAX = 1.0  # below, noise prevails in the inverse distances
 
