@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -149,8 +149,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
     Returns:
         The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
     """
-    S, dx = prior, np.zeros(len(prior))
-    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
+    S, dx, offset = prior, np.zeros(len(prior)), np.zeros(2 * len(image.ids))
     for step in range(_ITERATIONS):
         if step:
             lin = linearise(dx, S)
@@ -158,8 +157,8 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
                 break
             keep = keep & lin.valid
             # the innovation refers to the prior mean
-            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
-        fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
+            lin, offset = replace(lin, spread=lin.by_error @ prior), lin.ways @ (lin.by_error @ dx)
+        fit = _correct(prior, image, (image.uv - lin.z).ravel() + offset, lin, keep)
         fit.again = step > 0
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
@@ -179,7 +178,7 @@ def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
 
 
 def _correct(
-    prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
+    prior: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
     weight, k = 1.0 / np.repeat(image.sigma_px, 2), lin.ways.shape[1]
@@ -188,8 +187,7 @@ def _correct(
         curved = lin.curved * weight[:, None]
         if float(np.vecdot(curved, curved).max(initial=0.0)) > 1e-4:
             ways = np.concatenate([ways, curved], axis=1)
-    moves = np.concatenate([spread, lin.shared], axis=1) if lin.shared.size else spread
-    known = moves.shape[1]
+    moves, known = lin.moves, lin.moves.shape[1]
     for _ in range(3):
         rows = rows_of(keep)
         kept, r_kept = ways[rows], r[rows]

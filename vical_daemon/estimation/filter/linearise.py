@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -63,7 +63,7 @@ class Image:
     scale: float = 1.0
 
 
-@dataclass(slots=True)
+@dataclass
 class Linear:
     """One image linearised: z + ways (spread e + shared c) + curved u, in pixels; e, c, u ~ N(0, I).
 
@@ -89,7 +89,7 @@ class Linear:
     shared: FloatArray
     by_shared: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
-    @property
+    @cached_property
     def moves(self) -> FloatArray:
         """Square root of how far states and what corners share move the image, shape (k, c + r)."""
         return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
