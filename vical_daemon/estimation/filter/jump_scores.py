@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from vical_daemon.estimation.filter.passed import Corrected, Moved, by_step, said
 from vical_daemon.estimation.measurements import FloatArray
@@ -94,7 +93,7 @@ class JumpScores(NamedTuple):
             part: Which of the directions.
         """
         each = _likelihoods(self.information[:, part, part], self.weighted[:, part])
-        return np.asarray(logsumexp(each, axis=-1) - np.log(len(SIZES)))
+        return np.asarray(np.logaddexp.reduce(each, axis=-1) - np.log(len(SIZES)))
 
 
 def _before(A: FloatArray, b: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -153,7 +152,7 @@ class JumpSizes:
     def any_size(self) -> float:
         """Logarithm of the likelihood if the jump may be of any size, over that if one sigma is as given."""
         each = _likelihoods(*self._information())
-        return float(logsumexp(each) - np.log(len(SIZES)) - each[0])
+        return float(np.logaddexp.reduce(each) - np.log(len(SIZES)) - each[0])
 
     @property
     def sizes(self) -> FloatArray:
@@ -161,7 +160,7 @@ class JumpSizes:
         A, b = self._information()
         each = _likelihoods(A, b)
         out = np.zeros(len(b))
-        for weight, size in zip(np.exp(each - logsumexp(each)), SIZES, strict=True):
+        for weight, size in zip(np.exp(each - np.logaddexp.reduce(each)), SIZES, strict=True):
             covariance = size**2 * np.linalg.inv(unit(len(b)) + size**2 * A)
             out += weight * ((covariance @ b) ** 2 + np.diag(covariance))
         return np.sqrt(out)

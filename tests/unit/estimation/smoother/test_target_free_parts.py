@@ -401,6 +401,22 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     assert fit.noise.spread < 1.15
 
 
+def test_many_features_that_move_are_told_before_the_window_is_adjusted_to_the_end(scene):
+    """With the noise as measured with them it was adjusted twice, in 10 steps instead of 7."""
+    rng, way = np.random.default_rng(4), {}
+    frames = []
+    for t_s, frame in scene.frames:
+        for name in frame.ids.tolist():
+            way.setdefault(name, 30.0 * rng.standard_normal(2) * (rng.random() < 0.3))
+        shifts = t_s * np.array([way[name] for name in frame.ids.tolist()])
+        frames.append((t_s, replace(frame, uv_px=frame.uv_px + shifts)))
+    fit = bundle_of(scene.window(frames=frames), POSE_AND_CLOCK, 1.0).solve(scene.buffer, 25)
+    assert fit.settled and fit.steps < 9
+    assert fit.noise.sigma_px == pytest.approx(0.5, rel=0.1)
+    error, P = off_truth(fit.carry, scene), fit.carry.covariance()[CORE:, CORE:]
+    assert error @ np.linalg.solve(P, error) < 27.9  # chi-square, 9 degrees of freedom, 99.9 %
+
+
 def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
     window = scene.window()
     fit = bundle_of(window, POSE_AND_CLOCK, 1.0).solve(scene.buffer, 25)
