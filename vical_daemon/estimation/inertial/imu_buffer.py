@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.lapack import dgelss
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
@@ -199,7 +200,17 @@ class ImuBuffer:
         rows = self.rows
         after = int(rows[:, 0].searchsorted(t_s))
         near = rows[max(after - 2, 0) : after + 2]
-        return None if len(near) < 3 else np.array(_parabola(near[:, 0].tolist(), t_s)) @ near[:, 1:]
+        if len(near) < 3:
+            return None
+        t = near[:, 0] - t_s
+        span_s = max(-float(t[0]), float(t[-1]))
+        powers = np.ones((len(t), 3))
+        powers[:, 1] = u = t / span_s
+        powers[:, 2] = 0.5 * u * u
+        _, found, _, _, _, info = dgelss(powers, near[:, 1:], cond=_DISTINCT)
+        found[1] /= span_s
+        found[2] /= span_s**2
+        return None if info else np.asarray(found[1:3])
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -288,29 +299,6 @@ class ImuBuffer:
         before, at, after = sums.at(np.concatenate([t_s - half, t_s, t_s + half])).reshape(3, -1, 6)
         half = half[:, None]
         return (after - before) / (2.0 * half), (after - 2.0 * at + before) / half**2
-
-
-def _parabola(t_s: list[float], at_s: float) -> tuple[list[float], list[float]]:
-    """What values at three or four times count in both derivatives of their parabola (least squares).
-
-    By polynomials that are orthogonal over these times. In plain numbers: LAPACK takes twice as long.
-
-    Args:
-        t_s: Times of the values, s.
-        at_s: Of the derivatives, s.
-    """
-    middle_s = sum(t_s) / len(t_s)
-    line = [t - middle_s for t in t_s]
-    squares = [u * u for u in line]
-    size = sum(squares)
-    if size == 0.0:
-        return [0.0] * len(line), [0.0] * len(line)
-    mean, slope = size / len(line), sum(u * v for u, v in zip(line, squares, strict=True)) / size
-    bend = [v - slope * u - mean for u, v in zip(line, squares, strict=True)]
-    bent = sum(v * v for v in bend)
-    share = 1.0 / bent if bent > (_DISTINCT * size) ** 2 else 0.0
-    turned = (2.0 * (at_s - middle_s) - slope) * share
-    return [u / size + turned * v for u, v in zip(line, bend, strict=True)], [2.0 * share * v for v in bend]
 
 
 def _moved(values: FloatArray, live: slice, length: int) -> FloatArray:
