@@ -53,7 +53,7 @@ class RangeLimits(Generic[T]):
     repeat such a value are held until it is decided. Where a driver reads a sensor more often than it
     measures, its three channels repeat at once, which shows nothing about the range. A stream whose first
     readings repeat one channel, while the others of that sensor change, begins at the end. A larger value
-    later shows that it was not the end.
+    later shows that it was not the end. No channel is at the end where another has been further.
 
     Attributes:
         found: How often an end was found.
@@ -153,7 +153,7 @@ class RangeLimits(Generic[T]):
             self._stays[i] = 0
         elif self._stays[i] or change >= _AT_RANGE * step:
             self._stays[i] = self._stays[i] + 1 if value == extreme else 1
-        if value == extreme:
+        if value == extreme and value >= _NEAR * max(self._extreme[k] for k in _CHANNELS[i % 6 // 3]):
             clips = self._stays[i] >= _STOPS or self._returns(i)
             self.found += clips and not self._clips[i]
             self._clips[i] |= clips

@@ -51,6 +51,16 @@ def test_readings_within_the_range_are_not(step) -> None:
     assert at_range(motion(step=step)).mean() < 1e-3
 
 
+@pytest.mark.parametrize("further", [False, True])
+def test_a_channel_is_not_at_its_range_where_another_has_been_further(further) -> None:
+    """A crest of a sensor that counts in 0.5 deg/s had been one (EuRoC's, rounded)."""
+    six = motion(4.0, step=2e-3)
+    six[:, 1:3] = np.round(six[:, 1:3] / 4e-3) * 2e-3
+    six[:, 0] = np.minimum(six[:, 0], 1.5)
+    six[2, 2] = 2.2 if further else 1.2
+    assert at_range(six).any() != further
+
+
 @pytest.mark.parametrize("sensor", [slice(0, 3), slice(3, 6)])
 def test_a_sensor_that_is_read_more_often_than_it_measures_is_not_at_its_range(sensor) -> None:
     six = motion()
