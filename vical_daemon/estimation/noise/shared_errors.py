@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import SURE
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, SURE
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -27,6 +27,8 @@ JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
 _WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
 _WANDERS_S = 5e-4  # three times what they show there; an exposure that varies moves the time shift by ms
+_BY_SCALE = 3.0 * ENTRY_SIGMA
+"""Share of the interval between two images by which an IMU's errors of scale make the second look late."""
 _MOST_ALIKE = 1.5
 """Correlation of delays, as measured. Wrong lenses and clipped readings move images for longer: 2 to 3."""
 WAYS = 3  # late, to the side, down
@@ -63,6 +65,8 @@ class SharedErrors:
     correlation_known: bool = False
     images: int = 0
     until_s: float = -math.inf
+    _added_s: float = math.inf  # stamp of the last image that was added
+    _interval_s: float = 0.0  # between images
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
     _A: FloatArray = field(default_factory=lambda: np.zeros((MEMORY, WAYS, WAYS)))
     _C: FloatArray = field(default_factory=lambda: np.zeros((MEMORY, WAYS, WAYS)))
@@ -108,6 +112,8 @@ class SharedErrors:
         self._C[place] = level * (A + state @ state.T)
         self.images += 1
         if self.images % _EVERY == 0:
+            self._interval_s = max(t_cam_s - self._added_s, 0.0) / _EVERY
+            self._added_s = t_cam_s
             self._add(slice(place + 1 - _EVERY, place + 1))
 
     def _add(self, new: slice) -> None:
@@ -126,7 +132,7 @@ class SharedErrors:
         self.correlation_known = math.isfinite(alike)
         varies = (
             surely
-            and self.jitter_s > _WANDERS_S
+            and self.jitter_s > max(_WANDERS_S, _BY_SCALE * self._interval_s)
             and (not self.correlation_known or PERSISTENT < alike < _MOST_ALIKE)
         )
         self.wander_s = self.jitter_s if varies else 0.0
