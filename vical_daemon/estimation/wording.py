@@ -318,9 +318,10 @@ def _accel_lag(event: Event) -> str:
 
 def _imu_noise(event: Event) -> str:
     than = "worse" if (event.value or 0.0) > 1.0 else "better"
+    also = "; errors of lens, target or IMU that last for a second look alike" if than == "worse" else ""
     return (
         f"the IMU predicts images {than} than its noise densities say ({_Figure(event):.1f times}): "
-        "measure them with `vical allan`"
+        f"measure them with `vical allan`{also}"
     )
 
 
@@ -381,7 +382,7 @@ _EVENTS: dict[EventKind, str | Callable[[Event], str]] = {
     EventKind.IMAGES_WANDER: "whole images move by {:.1f px} relative to the motion of the IMU: switch off "
     "image stabilisation; neither lens, camera nor board may move by itself",
     EventKind.TIMESHIFT_VARIES: "the time shift varies by {:.1f ms} within seconds: fix the exposure time, "
-    "or stamp the middle of exposures",
+    "or stamp the middle of exposures; errors of a gyro that grow with its rate look alike",
     EventKind.STAMPS_STEPPED: "its stamps stepped by about {:+.1f s} relative to those of the IMU",
     EventKind.IMU_CLOCK_SET_BACK: "the IMU's stamps went back by {:.1f s}: its clock was set",
     EventKind.IMU_CLOCK_REMAPPED: "the IMU's stamps moved by {:+.1f ms}: its driver mapped the clock again; "

@@ -29,6 +29,9 @@ ENTRY_SIGMA = 2e-3
 """Scale or alignment of an IMU that is not as it says, each entry."""
 KNOWN_OFF_SIGMA = 1e-2
 """The same of an IMU that is known to be off, or whose matrices are asked for."""
+G_SENSITIVITY_S_PER_M = math.radians(0.1) / 9.81
+"""Rate that a gyro shows for a specific force, rad/s over m/s^2: 0.1 deg/s for 1 g in data sheets of consumer
+gyros, 0.01 to 0.02 of industrial ones. Not estimated."""
 APART_SIGMA_M = 5e-3
 """How far the axes of an accelerometer are from each other where they are chips of their own, m."""
 LAG_SIGMA_S = 3e-4

@@ -15,6 +15,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.significance import LIKELY_SIGMAS
+from vical_daemon.estimation.status.motion_levels import MotionLevels
 from vical_daemon.estimation.status.mounting_changes import IRRELEVANT_PX, IRRELEVANT_S
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
@@ -25,14 +26,16 @@ class Known(NamedTuple):
     """What is known of a camera that may step.
 
     Attributes:
+        t_s: When, s.
         intrinsics: fx fy cx cy, px, shape (4,).
         intrinsics_sigma: As reported, but for what stretches disagree, px, shape (4,); zeros: not estimated.
         timeshift_s: Time shift, s.
         timeshift_sigma_s: As reported, s.
         biases: Of gyro, rad/s, and accelerometer, m/s^2, shape (6,).
-        biases_sigma: Likewise, as the filter knows them.
+        biases_sigma: Likewise, as the filter knows them, times the root of how long errors of images last.
     """
 
+    t_s: float
     intrinsics: FloatArray
     intrinsics_sigma: FloatArray
     timeshift_s: float
@@ -50,7 +53,9 @@ class Known(NamedTuple):
             where, spread = f.layout.cameras[name], math.sqrt(f.consistency[name].factor)
             lens = np.zeros(4) if where.intrinsics is None else spread * sigmas[where.intrinsics]
             shift_s = 0.0 if where.timeshift is None else spread * float(sigmas[where.timeshift])
-            out[name] = cls(camera.intrinsics.copy(), lens, camera.timeshift_s, shift_s, biases, biases_sigma)
+            shift = camera.timeshift_s, shift_s
+            of_biases = biases, spread * biases_sigma
+            out[name] = cls(f.state.t_s, camera.intrinsics.copy(), lens, *shift, *of_biases)
         return out
 
 
@@ -113,11 +118,16 @@ class PendingChange:
         """This change if another was pending: what is known is compared with what it was before both."""
         return self if earlier is None else replace(self, before=earlier.before, number=earlier.number + 1)
 
-    def news(self, f: CalibrationFilter) -> Event | None:
-        """What is to be announced of a change that is confirmed, of filter `f`, and was not announced yet.
+    def news(self, f: CalibrationFilter, motion: MotionLevels) -> Event | None:
+        """What is to be announced of a change that is confirmed, and was not announced yet.
 
         Nothing if all is as it was before, within what both leave open: images were wrong for a while. Nor
-        if the IMU's stamps may have stepped instead: its driver says how well it knows them now.
+        if the IMU's stamps may have stepped instead (its driver says how well it knows them now), or if the
+        rig moves otherwise than before, and biases differ by no more than they may by that.
+
+        Args:
+            f: The filter.
+            motion: Of the rig.
         """
         now, before = Known.of(f)[self.camera], self.before[self.camera]
         step_s = now.timeshift_s - before.timeshift_s
@@ -131,7 +141,8 @@ class PendingChange:
         if self.part is Part.LENS and not self.moved and stepped.any():
             return Event(EventKind.LENS_STEPPED, self.camera, float(step_px[0]))
         step = now.biases - before.biases
-        open_step = LIKELY_SIGMAS * np.hypot(now.biases_sigma, before.biases_sigma)
+        by_motion = motion.bias_sigmas(before.t_s, self.at_s)
+        open_step = LIKELY_SIGMAS * np.hypot(np.hypot(now.biases_sigma, before.biases_sigma), by_motion)
         if self.part is Part.BIASES and not self.moved and (np.abs(step) > open_step).any():
             return Event(EventKind.BIASES_STEPPED, value=float(np.linalg.norm(step[:3])))
         return None

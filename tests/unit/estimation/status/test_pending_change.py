@@ -10,8 +10,10 @@ from tests.unit.estimation.some_filter import some_filter
 from tests.unit.estimation.test_calibrator import calibrate, errors
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
+from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS
 from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.status.motion_levels import MotionLevels
 from vical_daemon.estimation.status.pending_change import MOST_CHANGES, Known, PendingChange
 from vical_daemon.estimation.status.what_jumped import Part
 
@@ -55,7 +57,7 @@ def test_a_step_is_announced_if_it_exceeds_what_is_left_open(part, kind, step, s
         f.state.cameras["cam0"].intrinsics[0] += step
     else:
         f.state.cameras["cam0"].timeshift_s += step
-    event = change.news(f)
+    event = change.news(f, MotionLevels())
     if certain:
         assert (event.kind, event.value) == (kind, pytest.approx(step))
     else:
@@ -69,11 +71,31 @@ def test_a_step_of_the_biases_is_announced_if_it_exceeds_what_is_left_open(certa
         f.forget(row, 1e-4 if certain else 1e-2)
     change = PendingChange(Part.BIASES, frozenset({Part.BIASES}), "cam0", 0.0, Known.of(f))
     f.state.gyro_bias = f.state.gyro_bias + np.array([3e-3, 0.0, 4e-3])
-    event = change.news(f)
+    event = change.news(f, MotionLevels())
     if certain:
         assert (event.kind, event.value) == (EventKind.BIASES_STEPPED, pytest.approx(5e-3))
     else:
         assert event is None
+
+
+@pytest.mark.parametrize(("rate_rps", "announced"), [(1.0, True), (0.05, False)])
+def test_biases_that_differ_from_motion_to_rest_have_not_stepped(rate_rps, announced):
+    """By less than 0.2 % of the rate: EuRoC's gyro differs by 0.17 deg/s once the rig is held still."""
+    f, motion = some_filter()[0], MotionLevels()
+    for row in range(GYRO_BIAS.start, ACCEL_BIAS.stop):
+        f.forget(row, 1e-4)
+
+    def move(from_s, to_s, rate_rps):
+        for t_s in np.arange(from_s, to_s, 0.1):
+            f.state.t_s = float(t_s)
+            f.rates = Rates(rate_rps * np.sin(10.0 * t_s) * np.ones(3), np.zeros(3))
+            motion.look(f)
+
+    move(0.0, 20.0, 1.0)
+    change = PendingChange(Part.BIASES, frozenset({Part.BIASES}), "cam0", 22.0, Known.of(f))
+    move(20.0, 25.0, rate_rps)
+    f.state.gyro_bias = f.state.gyro_bias + np.array([1e-3, 2e-3, 2e-3])
+    assert (change.news(f, motion) is not None) is announced
 
 
 @pytest.mark.parametrize(("stamps_s", "announced"), [(2e-3, False), (2e-4, True)])
@@ -84,7 +106,7 @@ def test_a_step_within_what_the_driver_leaves_open_is_one_of_its_stamps(stamps_s
     change = PendingChange(Part.SHIFT, frozenset({Part.SHIFT}), "cam0", 0.0, Known.of(f))
     f.state.cameras["cam0"].timeshift_s -= 2.6e-3
     f.stamp_sigma_s = stamps_s
-    assert (change.news(f) is not None) is announced
+    assert (change.news(f, MotionLevels()) is not None) is announced
 
 
 def test_after_two_changes_in_a_row_that_did_not_hold_none_is_believed(monkeypatch):
