@@ -325,7 +325,7 @@ class Calibrator:
             return [report]
         self._note(f, report, frame, t_cam_s)
         if self._change is not None and self._change.confirmed(f.state.t_s):
-            news, self._change = self._change.news(f, self.watch.motion), None
+            news, self._change = self._change.news(f, self._past.motion), None
             self.evaluator.announce_all([] if news is None else [news])
         if f.unobservable is None and self._change is None and not self.watch.undecided:
             for block, event in self._acceptance.look(f).items():

@@ -23,7 +23,6 @@ from vical_daemon.estimation.model.priors import SURE
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.selection.clock_drift import apart, stamps_variance
 from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_SIGMAS
-from vical_daemon.estimation.status.motion_levels import MotionLevels
 from vical_daemon.estimation.status.recent_past import BEFORE_S
 
 _SPAN = 20  # estimates that are compared, one a second
@@ -109,11 +108,9 @@ class ChangeWatch:
 
     Attributes:
         why: Cause of the last restart.
-        motion: How the rig moved lately.
     """
 
     why: Cause = Cause.NONE
-    motion: MotionLevels = field(default_factory=MotionLevels)
     _refused: dict[str, int] = field(default_factory=dict)  # in a row, by camera
     _closer: int = 0  # images until what has changed is decided; 0: nothing has
     _suspected: int = 0  # images since something may have changed; 0: nothing may
@@ -164,7 +161,6 @@ class ChangeWatch:
                 are more likely to be errors of lens and target that last, which are not measured yet.
         """
         t = f.state.t_s
-        self.motion.look(f)
         refused = self._refused.get(report.camera, 0) + 1
         self._refused[report.camera] = 0 if report.used else refused
         consistency = f.consistency[report.camera]

@@ -20,6 +20,7 @@ from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.significance import EVERY_S
+from vical_daemon.estimation.status.motion_levels import MotionLevels
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import (
     Orientations,
@@ -65,13 +66,19 @@ class _Copy(NamedTuple):
 
 @dataclass(slots=True)
 class RecentPast:
-    """Images of the last seconds by camera, and copies of the filter from before."""
+    """Images of the last seconds by camera, and copies of the filter from before.
 
+    Attributes:
+        motion: Of the rig.
+    """
+
+    motion: MotionLevels = field(default_factory=MotionLevels)
     _frames: dict[str, deque[tuple[float, PointsFrame, bool]]] = field(default_factory=dict)
     _copies: deque[_Copy] = field(default_factory=deque)
 
     def saw(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
         """Remember an image, whether it was used, and once a second the filter."""
+        self.motion.look(f)
         frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
         frames.append((t_cam_s, frame, report.used))
         likelihood, passed = report.log_likelihood, tuple(f.passed)
