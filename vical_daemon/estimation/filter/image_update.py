@@ -73,19 +73,17 @@ class ImageFit:
 def log_likelihood(fit: ImageFit | None, image: Image) -> float:
     """Of an image, by its innovation, up to a constant: what is refused counts as if it were at its gate.
 
-    Filters whose noise of corners has grown differently can be compared: its logarithm is counted. Measured
-    consistency (`Image.scale`) is about what the state can explain. The rest has the noise that it shows.
+    Filters whose noise of corners has grown differently can be compared: its logarithm is counted.
 
     Args:
         fit: Its correction; None: it was refused.
         image: With its noise.
     """
-    dof = POSE_DOF if fit is None else fit.dof
-    noise = 2.0 * float(np.log(image.sigma_px).sum()) - (len(image.ids) - 0.5 * dof) * math.log(image.scale)
+    noise = 2.0 * float(np.log(image.sigma_px).sum())
     if fit is None:
-        return -0.5 * frame_limit(dof) - noise
+        return -0.5 * frame_limit(POSE_DOF) - noise
     kept = int(np.count_nonzero(fit.keep))
-    squares = fit.nis + fit.rest * image.scale / fit.noise**2 + (len(fit.keep) - kept) * _CORNER_GATE
+    squares = fit.nis + fit.rest / fit.noise**2 + (len(fit.keep) - kept) * _CORNER_GATE
     return -0.5 * (squares + fit.log_det - 2 * kept) - 2 * kept * math.log(fit.noise) - noise
 
 
