@@ -11,6 +11,7 @@ from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.filter.snapshot import imu_estimate
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
@@ -115,6 +116,16 @@ def test_nothing_is_known_about_mounting_and_delay_and_all_is_found(run, done):
     assert np.all(sigma[3:6] < np.deg2rad(0.05))
     assert sigma[6] < 1e-4
     assert estimate.nis_per_dof == pytest.approx(1.0, abs=0.2)
+
+
+def test_errors_of_images_that_last_widen_the_sigmas_of_the_biases(done):
+    f = deepcopy(done.filter)
+    f.consistency["cam0"].factor = 1.0
+    white = imu_estimate(f, (), None)
+    f.consistency["cam0"].factor = 9.0
+    lasting = imu_estimate(f, (), None)
+    assert lasting.gyro_bias_sigma_rps == pytest.approx([3.0 * s for s in white.gyro_bias_sigma_rps])
+    assert lasting.accel_bias_sigma_mps2 == pytest.approx([3.0 * s for s in white.accel_bias_sigma_mps2])
 
 
 def test_a_lens_that_needs_one_term_more_is_told_once_and_is_in_the_sigmas():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -87,7 +88,8 @@ def _lens_sigmas(
 
 def imu_estimate(f: CalibrationFilter, asked: Collection[str], axes_m: FloatArray | None) -> ImuEstimate:
     """Biases; where asked for, the matrices; positions of the accelerometer's axes, where they are given."""
-    sigma, state = f.sigmas(), f.state
+    spread = math.sqrt(max(camera.factor for camera in f.consistency.values()))
+    sigma, state = spread * f.sigmas(), f.state
     return imu_snapshot(
         np.concatenate([state.gyro_bias, state.accel_bias]),
         np.concatenate([sigma[GYRO_BIAS], sigma[ACCEL_BIAS]]),
