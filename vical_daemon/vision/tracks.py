@@ -7,13 +7,13 @@ add up along a track; an epipolar check against a frame some time ago. New featu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, IntArray, as_gray
+from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, IntArray, as_gray, median
 from vical_daemon.vision.flow_prediction import FlowPredictor
 from vical_daemon.vision.patches import Float32, Templates, no_templates
 
@@ -56,12 +56,23 @@ class TrackOptions:
     sigma_floor_px: float = 0.1
 
 
+_PARTS = (16, 12)  # columns and rows of a picture's parts; their median tells light from what moves
+
+
 @dataclass(frozen=True)
 class _Picture:
-    """A picture at half the size (pixel u is at u / 2), and its stamp, ns."""
+    """A picture at half the size (pixel u is at u / 2), grey levels (plus 1) of its parts, its stamp, ns."""
 
     half: Gray
+    levels: FloatArray
     t_ns: int | None
+
+    @classmethod
+    def of(cls, gray: Gray, t_ns: int | None) -> _Picture:
+        """Of a picture at full size."""
+        half = np.asarray(cv2.pyrDown(gray), np.uint8)
+        levels = cv2.resize(half, _PARTS, interpolation=cv2.INTER_AREA)
+        return cls(half, levels.ravel() + 1.0, t_ns)
 
 
 @dataclass
@@ -129,7 +140,7 @@ class FeatureTracker:
         """
         gray = as_gray(image)
         smooth: Float32 = np.asarray(cv2.sepFilter2D(gray, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
-        now = _Picture(np.asarray(cv2.pyrDown(gray), np.uint8), t_ns)
+        now = _Picture.of(gray, t_ns)
         if self._last is not None and self._last.half.shape != now.half.shape:
             self._features, self._last = _Features(), None
         self._frame += 1
@@ -149,6 +160,7 @@ class FeatureTracker:
         """Follow the features there and back; at half the size, as the alignment corrects a pixel or less."""
         features, options = self._features, self.options
         height, width = shape
+        before, now = _equally_bright(before, now)
         guess = self.predictor.predict(features.uv, before.t_ns, now.t_ns)
         uv, good = self._flow(before, now, features.uv, guess, options.levels, options.window_px)
         border = options.border_px
@@ -249,6 +261,14 @@ class FeatureTracker:
             ids = np.arange(self._next_id, self._next_id + len(begin), dtype=np.int64)
             self._next_id += len(begin)
             features.add(ids, begin, Templates.cut(smooth, begin), options.sigma_floor_px)
+
+
+def _equally_bright(one: _Picture, other: _Picture) -> tuple[_Picture, _Picture]:
+    """Both as dark as the darker one: Lucas-Kanade takes light and exposure that change for motion."""
+    gain = median(other.levels / one.levels)
+    if gain > 1.0:
+        return one, replace(other, half=np.asarray(cv2.convertScaleAbs(other.half, alpha=1.0 / gain)))
+    return replace(one, half=np.asarray(cv2.convertScaleAbs(one.half, alpha=gain))), other
 
 
 def _vertices(gray: Gray, uv: FloatArray) -> FloatArray:

@@ -138,6 +138,15 @@ def test_something_that_moves_by_itself_is_dropped(pictures):
     assert on_patch.sum() <= 5
 
 
+def test_light_that_changes_from_picture_to_picture_loses_nothing(pictures):
+    steady, flickering = FeatureTracker(), FeatureTracker()
+    for k, picture in enumerate(pictures[:6]):
+        wanted = steady.detect(picture, stamp(k))
+        found = flickering.detect(cv2.convertScaleAbs(picture, alpha=(0.6, 1.0)[k % 2]), stamp(k))
+    old = steady.options.max_features  # ids of the first picture are below
+    assert np.sum(found.ids < old) > 0.8 * np.sum(wanted.ids < old) > 20
+
+
 def test_darkness_and_another_size_start_anew(pictures):
     tracker = FeatureTracker()
     before = tracker.detect(pictures[0], stamp(0))
