@@ -12,6 +12,7 @@ explain. P keeps the shape near what is foretold, see `SHAPE_PX`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from functools import cache
 
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.vision.detection import FloatArray
+from vical_daemon.vision.saddle import SMOOTHING_PX
 
 BoolArray = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
@@ -30,6 +32,7 @@ ITERATIONS = 2  # Gauss-Newton steps, from a place that is predicted to a pixel 
 SHAPE_PX = 2.0
 """Standard deviation of a feature's place over that of its W in one step, px: what a window tells of a place,
 0.04 px, and 2 % by which the flow around a feature in the next image differs from the mean flow."""
+_ALIKE_PX = 4.0 * math.pi * SMOOTHING_PX**2  # pixels over which smoothing makes the noise of a picture alike
 _FARTHEST_PX = 0.7  # largest step: farther from it the picture is not linear
 _MOST_BENT = 0.1  # largest change of shape in a step
 _NO_CONTRAST = 1e-3  # squared grey levels, keeps the sums of a plain window invertible
@@ -107,7 +110,7 @@ class Templates:
             W = W @ (np.eye(2) - _at_most(step[:, 2:, 0], _MOST_BENT).reshape(-1, 2, 2))
             uv = uv - _at_most((W @ step[:, :2])[:, :, 0], _FARTHEST_PX)
         rest = np.linalg.norm(error, axis=1)
-        spread = rest**2 / SIZE**2 * (self.inverse[:, 0, 0] + self.inverse[:, 1, 1]) / 2
+        spread = _ALIKE_PX * rest**2 / SIZE**2 * (self.inverse[:, 0, 0] + self.inverse[:, 1, 1]) / 2
         return uv, W, np.asarray(rest / strength, np.float64), np.sqrt(spread)
 
 

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, IntArray, as_gray, median
 from vical_daemon.vision.flow_prediction import FlowPredictor
 from vical_daemon.vision.patches import Float32, Templates, no_templates
+from vical_daemon.vision.saddle import SMOOTHING_PX
 
 BoolArray = npt.NDArray[np.bool_]
 
-SMOOTHING_PX = 0.8  # as in `saddle`
 _KERNEL = cv2.getGaussianKernel(5, SMOOTHING_PX, cv2.CV_32F)
 
 
@@ -53,7 +53,7 @@ class TrackOptions:
     epipolar_px: float = 1.5
     fast_threshold: int = 18
     border_px: int = 8
-    sigma_floor_px: float = 0.1
+    sigma_floor_px: float = 0.05
 
 
 _PARTS = (16, 12)  # columns and rows of a picture's parts; their median tells light from what moves

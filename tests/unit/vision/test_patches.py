@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.vision.patches import Templates, no_templates
+from vical_daemon.vision.saddle import SMOOTHING_PX
 
 CENTRES_PX = np.array([[60.0, 60.0], [100.0, 60.0], [60.0, 100.0], [100.0, 100.0]])
 
@@ -69,3 +70,19 @@ def test_sets_are_cut_and_joined(scene):
     back = no_templates().joined(templates.take(np.array([0, 1]))).joined(templates.take(np.array([2, 3])))
     for name in ("values", "slopes", "inverse"):
         assert np.array_equal(getattr(back, name), getattr(templates, name))
+
+
+def test_the_stated_sigma_is_that_of_smoothed_noise(scene):
+    rng, clean, upright = np.random.default_rng(3), picture(scene), np.broadcast_to(np.eye(2), (4, 2, 2))
+
+    def seen():
+        noisy = clean + rng.normal(0.0, 6.0, clean.shape).astype(np.float32)
+        return cv2.GaussianBlur(noisy, (5, 5), SMOOTHING_PX)
+
+    errors, sigmas = [], []
+    for _ in range(60):
+        uv, _, _, sigma = Templates.cut(seen(), CENTRES_PX).align(seen(), CENTRES_PX, upright)
+        errors.append(uv - CENTRES_PX)
+        sigmas.append(sigma)
+    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(sigmas)))
+    assert 0.75 < ratio < 1.25  # 480 numbers; 2.6 if neighbouring pixels were taken to be independent
