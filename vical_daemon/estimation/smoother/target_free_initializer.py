@@ -281,17 +281,17 @@ def _best_fit(
     features = len(LAGS_S) * sum(len(f.ids) for _, f in frames)
     every = max(1, math.ceil(features / _MOST_FEATURES))
 
-    def fit(R: FloatArray, shift_s: float, *, fit_lens: bool = False) -> EpipolarFit | None:
-        return epipolar_fit(t, gyro, frames, lens, R, shift_s, fit_lens=fit_lens, every=every)
+    def fit(R: FloatArray, shift_s: float, **how: bool) -> EpipolarFit | None:
+        return epipolar_fit(t, gyro, frames, lens, R, shift_s, every=every, **how)
 
-    if len(seeds) != 1 or not free_lens:  # look around with the lens as given: three times quicker
-        fits = [f for f in (fit(*seed) for seed in seeds) if f is not None]
+    if len(seeds) != 1:  # look around with the lens as given: three times quicker
+        fits = [f for f in (fit(*seed, roughly=True) for seed in seeds) if f is not None]
         best = min(fits, key=_misfit, default=None)
-        if best is None or not free_lens:
-            return best
+        if best is None:
+            return None
         seeds = [(best.R_imu_cam, best.timeshift_s)]
     # turns about one axis may not show the lens; the window estimates it later
-    return fit(*seeds[0], fit_lens=True) or fit(*seeds[0])
+    return (fit(*seeds[0], fit_lens=True) if free_lens else None) or fit(*seeds[0])
 
 
 def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray | None:

@@ -19,6 +19,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, IntArray
 from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.significance import STRETCH_S
@@ -92,6 +93,7 @@ def epipolar_fit(
     fit_lens: bool = False,
     every: int = 1,
     gyro_density: float | None = None,
+    roughly: bool = False,
 ) -> EpipolarFit | None:
     """Fit mounting, delay, gyro bias (and the focal length) to tracks.
 
@@ -106,6 +108,9 @@ def epipolar_fit(
         every: See `make_pairs`.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
             along tracks goes into `covariance` and `stretches`.
+        roughly: End where a step is predicted to lower the squared errors by less than `DONE`: enough to
+            compare places to start from. Errors are weighted anew, so each step is two thirds of the one
+            before, and else hardly any fit ends before its last step.
 
     Returns:
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
@@ -115,7 +120,7 @@ def epipolar_fit(
     if pairs is None:
         return None
     fit = _Fit(t_imu_s, gyro_rps, frames, pairs, lens, fit_lens, gyro_density)
-    return fit.run(R_imu_cam.copy(), timeshift_s)
+    return fit.run(R_imu_cam.copy(), timeshift_s, roughly=roughly)
 
 
 class _Fit:
@@ -170,7 +175,7 @@ class _Fit:
         out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
         return np.asarray(out)
 
-    def run(self, R: FloatArray, shift: float) -> EpipolarFit | None:
+    def run(self, R: FloatArray, shift: float, *, roughly: bool) -> EpipolarFit | None:
         bias = np.zeros(3)
         weight = np.where(self.ok, 1.0, 0.0)
         for step in range(_ITERATIONS):
@@ -188,6 +193,7 @@ class _Fit:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
             self._prior(H, g, bias)
             dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
+            near = roughly and float(-g @ dx) < DONE
             dx *= min(1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12))
             R = R @ so3.exp(dx[:3])
             shift += float(dx[3])
@@ -198,7 +204,8 @@ class _Fit:
                 self._rays()
                 if self.ok.mean() < _LEAST_RAYS:
                     return None  # the lens has run away
-            if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
+            near |= float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6
+            if near and step > _LENS_AFTER + 2:
                 break
         return self._result(R, shift, bias, weight)
 

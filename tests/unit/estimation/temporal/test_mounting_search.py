@@ -47,6 +47,24 @@ def test_the_mounting_is_among_the_likely_ones_with_nothing_known(wall):
     assert abs(best.timeshift_s) < 5e-3
 
 
+def test_looking_around_roughly_finds_the_same_place(wall):
+    """Fits that are only compared took all their steps, up to 70 % of the CPU time of an attempt."""
+    found = likely_mountings(wall.t, wall.gyro, wall.frames, wall.lens, np.linspace(-0.2, 0.2, 5))
+
+    def fitted(*seed, **how):
+        return epipolar_fit(wall.t, wall.gyro, wall.frames, wall.lens, *seed, **how)
+
+    def from_the_best(**how):
+        fits = [fitted(*seed, **how) for seed in found]
+        best = min((f for f in fits if f), key=lambda f: f.error / f.inliers)
+        return fitted(best.R_imu_cam, best.timeshift_s)
+
+    here, there = from_the_best(roughly=True), from_the_best()
+    assert np.rad2deg(np.linalg.norm(so3.log(here.R_imu_cam.T @ there.R_imu_cam))) < 0.4
+    assert abs(here.timeshift_s - there.timeshift_s) < 4e-4
+    assert here.error / here.inliers < 1.01 * there.error / there.inliers
+
+
 def test_only_mountings_near_what_is_known_are_returned(wall):
     near = wall.rig.R_imu_cam @ so3.exp(np.deg2rad([0.0, 30.0, 0.0]))
     found = likely_mountings(wall.t, wall.gyro, wall.frames, wall.lens, np.zeros(1), near)
