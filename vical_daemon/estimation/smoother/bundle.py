@@ -23,7 +23,8 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left, moves
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
-from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View
+from vical_daemon.estimation.smoother.normal import HUBER, ImageNoise, Normal, Problem, View, inverse_roots
+from vical_daemon.estimation.smoother.track_errors import with_track_errors
 from vical_daemon.estimation.smoother.window import Seen, Window
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
@@ -46,7 +47,8 @@ class Fit(NamedTuple):
     """How a window came out.
 
     Attributes:
-        carry: What goes on from its last image.
+        carry: What goes on from its last image; sigmas as tracks show them (`with_track_errors`).
+        counted: The same by the noise of the pixels alone.
         squares: Sum of squared whitened pixel errors of the observations kept.
         dof: Their degrees of freedom.
         inertial: Squared whitened errors of the links over their number of rows.
@@ -62,6 +64,7 @@ class Fit(NamedTuple):
     """
 
     carry: MarginalPrior
+    counted: MarginalPrior
     squares: float
     dof: int
     inertial: float
@@ -206,13 +209,9 @@ class Bundle:
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Normal matrix without landmarks (its upper triangle), gradient, what brings the landmarks back."""
-        order = self.problem.order()
-        F = len(self.window.frames)
-        tiny = 1e-10 * np.trace(normal.V, axis1=1, axis2=2)
-        V = normal.V * (1.0 + lam * np.eye(3)) + tiny[:, None, None] * np.eye(3)
-        root = np.linalg.cholesky(V)
-        inverse = np.linalg.inv(root)
-        L = len(V)
+        order, F = self.problem.order(), len(self.window.frames)
+        inverse = inverse_roots(normal.V, lam)
+        L = len(inverse)
         Y = np.matmul(inverse, normal.W).reshape(3 * L, -1)
         u = np.matmul(inverse, normal.gl[..., None]).reshape(-1)
         S = dsyrk(1.0, Y.T, lower=1).T  # Y'Y, its upper triangle
@@ -385,13 +384,13 @@ class Bundle:
     def _result(self, now: _Present, root: FloatArray | None, steps: int, *, settled: bool) -> Fit | None:
         """How the window came out, by its last normal equations and their root, if that is known."""
         w, order, view, seen = self.window, self.problem.order(), now.view, now.view.seen
-        root = self._root(now.normal) if root is None else root
-        if root is None:
+        if (root := self._root(now.normal) if root is None else root) is None:
             return None
         own = len(order.own)
         L22 = np.tril(root[order.tail - own :, order.tail - own :])
         try:
             covariance = np.asarray(np.linalg.inv(L22 @ L22.T), dtype=np.float64)
+            known = with_track_errors(covariance[own:, own:], self.problem, seen, now.normal, root)
         except np.linalg.LinAlgError:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
@@ -401,6 +400,7 @@ class Bundle:
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
         return Fit(
+            carried_out(w, known, self.carry),
             carried_out(w, covariance[own:, own:], self.carry),
             squares,
             max(self._dof(seen), 1),

@@ -37,8 +37,11 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
 
 HUBER = 2.5  # sigmas (of the two axes together)
-_CONSTANTS = 9  # the first column of them, see `_derivatives`
+POSE = slice(3, 9)
+"""Columns of `Normal.J` for turn and place of the image."""
+_CONSTANTS = 9  # the first column of them
 _GAUGE = 1e10  # information that holds the window's place and heading, 1/m^2 and 1/rad^2: 10 um
+_NO_DEPTH = 1e-10  # share of a landmark's information that is added to it: some have none about their depth
 _INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
 
 
@@ -52,6 +55,7 @@ class Normal(NamedTuple):
         W: Coupling of landmarks to [turn, position] of the images and to the camera, (L, 3, 6 F + c).
         gl: Gradient of the landmarks, shape (L, 3).
         cost: Sum of the (robust) squares.
+        J: Whitened derivatives of the N observations, see `_derivatives`, shape (N, 2, 9 + c + 1).
     """
 
     H: FloatArray
@@ -60,6 +64,7 @@ class Normal(NamedTuple):
     W: FloatArray
     gl: FloatArray
     cost: float
+    J: FloatArray
 
 
 class View(NamedTuple):
@@ -271,7 +276,7 @@ class Problem:
         w, order = self.window, self.order()
         F, L = len(w.frames), len(seen.begin)
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
-        columns, camera = self._camera_columns(), order.camera
+        columns, camera = self.camera_columns(), order.camera
         k = len(columns)
         by_camera = np.zeros((F, 6, k))
         for frame, rows in zip(seen.frames_with, np.split(seen.by_frame, seen.frame_begin[1:]), strict=True):
@@ -297,9 +302,9 @@ class Problem:
         by_frame[seen.landmark, :, seen.frame] = np.swapaxes(J[:, :, :3], 1, 2) @ J[:, :, 3:9]
         cost += add_links(w, self.noise.offsets, order, H, g)
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
-        return Normal(H, g, V, W, gl, cost)
+        return Normal(H, g, V, W, gl, cost, J)
 
-    def _camera_columns(self) -> IntArray:
+    def camera_columns(self) -> IntArray:
         """Columns of `_derivatives` for `Order.camera`: a window's own lens moves pixels as the lens does."""
         layout = self.carry.layout
         constants = _CONSTANTS + np.arange(layout.size - layout.dynamic)
@@ -378,6 +383,12 @@ class Problem:
         H[order.own[:, None], order.own] += self.lens_root.T @ self.lens_root
         g[order.own] += self.lens_root.T @ e
         return float(e @ e)
+
+
+def inverse_roots(V: FloatArray, damping: float = 0.0) -> FloatArray:
+    """Inverses of the lower Cholesky factors of the landmarks' blocks, shape (L, 3, 3)."""
+    tiny = _NO_DEPTH * np.trace(V, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(V * (1.0 + damping * np.eye(3)) + tiny * np.eye(3))))
 
 
 def _later(where: slice, columns: int) -> slice:

@@ -209,7 +209,7 @@ class TargetFreeStatus(Evaluator):
             complete: It will not grow any more: it counts for the measured variance.
         """
         # at the first image, where the change was taken; of the clocks by what most likely happened to them
-        after = fit.carry.at(carry.t_cam_s)
+        after = fit.counted.at(carry.t_cam_s)
         clocks = self.models.clocks(fit.carry, self.factor())
         change, (P_old, P_new) = compared_by(carry, after, fit.change, clocks)
         statistic, dof = square_of_change(change, P_old, P_new)

@@ -32,9 +32,8 @@ def carry(shrunk=1.0):
 
 def fit(times):
     """A window that halves the variance, and moves the calibration by `times` what it should."""
-    return SimpleNamespace(
-        change=np.concatenate([np.zeros(CORE), times * np.sqrt(0.5) * SIGMA]), carry=carry(0.5)
-    )
+    change = np.concatenate([np.zeros(CORE), times * np.sqrt(0.5) * SIGMA])
+    return SimpleNamespace(change=change, carry=carry(0.5), counted=carry(0.5))
 
 
 def focal_sigma(status):
