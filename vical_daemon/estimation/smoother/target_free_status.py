@@ -201,7 +201,8 @@ class TargetFreeStatus(Evaluator):
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
 
-        For consistent sigmas, cov(new - old) = P_old - P_new.
+        For consistent sigmas, cov(new - old) = P_old - P_new, if P_new is by the noise that the weights
+        of the pixels are from.
 
         Args:
             fit: Of the window.
