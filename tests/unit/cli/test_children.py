@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import socket
-import sys
 import threading
 import time
 from argparse import Namespace
@@ -20,8 +19,9 @@ from vical_daemon.cli.children import Children
 from vical_daemon.cli.errors import CliError
 from vical_daemon.config.model import BusConfig, Config
 
-LIVES = "import time; time.sleep(60)"
-FAILS = "raise SystemExit(2)"
+LIVES = "exec sleep 60"
+FAILS = "exit 2"
+SETTLED_S = 1.0  # a shell ends sooner, however busy the computer is
 
 
 class Started:
@@ -30,11 +30,11 @@ class Started:
     def __init__(self) -> None:
         self.programs = {"acquire": LIVES, "record": LIVES}
         self.starts: list[str] = []
-        self.children = Children(self.command, settled_s=0.3, again_s=0.3)
+        self.children = Children(self.command, settled_s=SETTLED_S, again_s=0.3)
 
     def command(self, name: str) -> list[str]:
         self.starts.append(name)
-        return [sys.executable, "-c", self.programs[name]]
+        return ["sh", "-c", self.programs[name]]
 
     def tend_until(self, done: Callable[[], bool]) -> None:
         end_s = time.monotonic() + 30.0
@@ -54,7 +54,7 @@ def started() -> Iterator[Started]:
 
 
 def test_what_fails_at_once_ends_all() -> None:
-    children = Children(lambda _: [sys.executable, "-c", FAILS], settled_s=30.0)
+    children = Children(lambda _: ["sh", "-c", FAILS], settled_s=30.0)
     children.start("record")
 
     def tend() -> None:
@@ -72,7 +72,7 @@ def test_what_fails_when_started_again_is_tried_later(
     caplog.set_level(logging.WARNING)
     first = started.children.start("record")
     acquire = started.children.start("acquire")
-    time.sleep(0.5)
+    time.sleep(1.2 * SETTLED_S)
     started.programs["record"] = FAILS
     os.kill(first, signal.SIGKILL)
     started.tend_until(lambda: started.starts.count("record") >= 3)
