@@ -22,7 +22,8 @@ def with_track_errors(
 ) -> FloatArray:
     """A window's covariance with the sigmas that its tracks show, and the same correlations.
 
-    Those of the constants that move pixels; none becomes smaller.
+    Those of lever arm, mounting and lens; none becomes smaller. Time shift and drift are left as they are:
+    their errors nearly cancel at the window's end, and would not if each had a scale of its own.
 
     Args:
         covariance: Of the states from `Order.tail` on, with pixels that err as measured, shape (t, t).
@@ -32,13 +33,15 @@ def with_track_errors(
         root: Cholesky factor of the states' matrix without landmarks, lower triangle.
     """
     order, J = problem.order(), normal.J
-    at = order.constants[len(order.imu) :]
+    layout, where = problem.carry.layout, problem.carry.layout.camera
+    blocks = (where.position, where.rotation, where.intrinsics, where.distortion)
+    at = order.constants[0] - layout.core + np.concatenate([np.r_[x] for x in blocks if x is not None])
     of_tail = at - order.tail
     X = np.zeros((order.size, len(at)))  # columns of the inverse
     head, tail = slice(None, order.tail), slice(order.tail, None)
     X[tail] = covariance[:, of_tail]
     X[head] = dtrsm(-1.0, root[head, head], root[tail, head].T @ X[tail], lower=1, trans_a=1)
-    # by how much each pixel moves these constants while its landmark stays,
+    # by how much each pixel moves these numbers while its landmark stays,
     moved = J[:, :, problem.camera_columns()] @ X[order.camera]
     poses = X[order.frames[:, :6]]
     for frame, rows in zip(seen.frames_with, np.split(seen.by_frame, seen.frame_begin[1:]), strict=True):

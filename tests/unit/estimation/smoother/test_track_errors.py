@@ -21,9 +21,9 @@ def drawn(rng, seen, memory):
 
 
 def scatter(bundle, memory):
-    """Of lever arm, mounting and time shift: the variance of what is found, and the mean of what is added."""
+    """Of lever arm and mounting: the variance of what is found, and the mean of what is added."""
     rng, problem, view, order = np.random.default_rng(6), bundle.problem, bundle.view, bundle.problem.order()
-    at = order.constants[len(order.imu) :][:7]
+    at = order.constants[len(order.imu) :][:6]
     found, added = [], []
     for draw in range(DRAWS):
         uv = view.uv + problem.noise.sigma_px * drawn(rng, view.seen, memory)
@@ -54,11 +54,10 @@ def white(adjusted):
 
 
 def test_errors_that_last_widen_each_sigma_by_what_they_do_to_it(adjusted, white):
-    """Three times the variance of the mounting, but hardly more of the time shift."""
+    """Three times the variance of the mounting."""
     lasting, added = scatter(adjusted, MEMORY)
     assert np.mean(added / (lasting - white[0])) == pytest.approx(1.0, abs=0.2)
-    more = added / white[0]
-    assert more[3:6].max() > 1.2 and more[6] < 0.6
+    assert (added / white[0])[3:6].max() > 1.2
 
 
 def test_errors_that_do_not_last_leave_sigmas_as_they_are(white):
