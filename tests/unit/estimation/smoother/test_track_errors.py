@@ -34,8 +34,9 @@ def scatter(bundle, memory):
             root = bundle._root(normal)
             L = np.tril(root[order.tail :, order.tail :])
             covariance = np.linalg.inv(L @ L.T)
-            more = with_track_errors(covariance, problem, seen.seen, normal, root) - covariance
-            added.append(np.diag(more)[at - order.tail])
+            more = np.diag(with_track_errors(covariance, problem, seen.seen, normal, root) - covariance)
+            assert not np.delete(more, at - order.tail).any()  # motion, biases, time shift and drift
+            added.append(more[at - order.tail])
     return np.var(found, axis=0, ddof=1), np.mean(added, axis=0)
 
 
