@@ -18,7 +18,8 @@ from vical_daemon.estimation.filter.image_pace import ImagePace
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
+from vical_daemon.estimation.init.board_window import LATE_S
+from vical_daemon.estimation.init.initializer import Attempt, Initializer
 from vical_daemon.estimation.init.late_camera import LateCameras
 from vical_daemon.estimation.init.motion_restart import MotionRestart, RecordingStart, motion_is_lost
 from vical_daemon.estimation.init.rig_model import RigModel

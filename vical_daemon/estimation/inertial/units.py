@@ -6,11 +6,13 @@ same check for recordings, before they are used, and for live data, until a cali
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import STANDARD_GRAVITY_MPS2, FloatArray, IntArray
+from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _SMOOTHING_S = 0.5  # of forces and rates: what is left of hand-held forces is mostly gravity
 _LIKE_GRAVITY = (6.0, 16.0)  # m/s^2: where the median of a moving accelerometer may be
@@ -28,8 +30,6 @@ _IN_G = 4.0  # the most that it reads in g, likewise
 _EITHER = f"it looks like g (multiply by {STANDARD_GRAVITY_MPS2}), or gravity is removed: move it more slowly"
 _LARGEST_BIAS_RPS = 0.5  # 30 deg/s; data sheets of the cheapest gyros have 20
 _STANDS = 0.05  # of the change that the gyro's rates mean
-_NO_GYRO = 4000.0  # the widest range of gyros, in deg/s
-_NO_FORCE_MPS2 = 500.0  # 50 g, the widest range of accelerometers
 _UNIT = 1e-2  # quaternions written with three digits
 _CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 _Turns = tuple[FloatArray, FloatArray]
@@ -68,7 +68,7 @@ def usual_rate_hz(t_ns: IntArray) -> float:
 
 def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
     slow, gyro = np.percentile(np.linalg.norm(samples.gyro_rps, axis=1), [5, 50]).tolist()
-    if gyro > _NO_GYRO:
+    if gyro > math.degrees(MOST_RPS):
         return (
             f"the gyro reads {gyro:.3g} in the middle, rad/s are expected; are these its columns, "
             "and not counts or stamps?"
@@ -87,7 +87,7 @@ def _accelerometer_mistake(samples: ImuArrays, correlation: float) -> str:
         and (correlation < _SURELY_TURNS or slow > _MOVES * gyro)
     ):
         text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
-    elif _LIKE_GRAVITY[1] < median < _NO_FORCE_MPS2 and low < _MOVES * median:
+    elif _LIKE_GRAVITY[1] < median < MOST_MPS2 and low < _MOVES * median:
         return ""  # violent motion
     elif constant := constant_channels(samples):
         text = constant

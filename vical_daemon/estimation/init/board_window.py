@@ -52,10 +52,13 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mc
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
-_TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _EDGE_S = (
     AGAIN_SIGMAS * 2.0 * SHIFT_SIGMA_S
 )  # by which the time shift may still move: five sigmas of the least a start is made with
+
+
+LATE_S = 2e-3
+"""Images less apart, s, share the motion of one instant: the pose is moved from one to the other."""
 
 
 @dataclass(slots=True)
@@ -473,7 +476,7 @@ def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: Im
         item = originals.get((seen.frame.camera, seen.frame.t_cam_ns))
         if item is None or not buffer.oldest_s + _EDGE_S < t_s < buffer.newest_s - _EDGE_S:
             continue
-        if nodes and t_s - nodes[-1].at.t_s < _TOGETHER_S:
+        if nodes and t_s - nodes[-1].at.t_s < LATE_S:
             nodes[-1].frames.append(item)
             continue
         camera = state.cameras[seen.frame.camera]
@@ -493,7 +496,7 @@ def _integrated(
 ) -> PreintegratedLinks | None:
     """Links between the instants; None where these are not in order or readings do not reach."""
     t_s = np.array([n.at.t_s for n in nodes])
-    if (np.diff(t_s) < 0.5 * _TOGETHER_S).any():
+    if (np.diff(t_s) < 0.5 * LATE_S).any():
         return None
     numbers = _numbers(state)
     return make_links(buffer, t_s, np.broadcast_to(numbers, (len(nodes) - 1, len(numbers))), noise)

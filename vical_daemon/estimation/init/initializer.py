@@ -15,6 +15,7 @@ from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.accelerometer_check import mistaken_axes
 from vical_daemon.estimation.init.attempts import LONG_S, Attempts, RestDetector, rest_in_words
+from vical_daemon.estimation.init.board_window import LATE_S
 from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rig_model import RigModel
@@ -31,8 +32,6 @@ _KEEP_S = 1.25 * LONG_S  # of images, however many they are
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
 _LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
 _NO_FIT = "the first seconds do not fit together yet: fix the board in the room, move the rig"
-LATE_S = 2e-3
-"""An image this little before the state is used by moving the pose back, s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import over_intervals, size_effect, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import APART, by_apart, by_entries, matrices, positions_m
 
-_MAX_HOLE_S = 0.1  # between readings; a window bridges twice what the filter does: it would have to restart
 RELINK_S = 3e-4  # of change of the time shift: links are integrated again between the new instants
 DONE = 1.0  # the last step of an adjustment is one with a smaller predicted reduction of the sum of squares
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
@@ -38,7 +37,8 @@ def make_links(
         The links; None where readings are missing for one, or none that a device could give.
     """
     found = buffer.intervals(t_s)
-    if found is None or found[0].gap_s > _MAX_HOLE_S:
+    # a window bridges twice what the filter does: it would have to restart
+    if found is None or found[0].gap_s > 2.0 * GAP_S:
         return None
     segment, begin = found
     counts = np.diff(np.append(begin, len(segment.t_s)))
