@@ -14,7 +14,6 @@ from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, 
 
 ALONG = 0.85
 """Cosine above which a direction is called by the name of an axis: within 32 deg."""
-_BESIDE = 0.3  # least share of a second axis in a direction that is called a line between two
 _AXIS_NAMES = dict(zip(AXES, ("the image's x axis", "the image's y axis", "the optical axis"), strict=True))
 _TURNS = {"x": "the image's x axis (nod)", "y": "the image's y axis (shake)", "z": "the optical axis (roll)"}
 
@@ -27,7 +26,7 @@ def axis_name(axis_cam: Sequence[float]) -> str:
     order = sorted(range(3), key=lambda i: -size[i])
     if size[order[0]] > ALONG:
         return _AXIS_NAMES[AXES[order[0]]]
-    if size[order[0]] ** 2 + size[order[1]] ** 2 > ALONG**2 and size[order[1]] > _BESIDE:
+    if size[order[0]] ** 2 + size[order[1]] ** 2 > ALONG**2:
         first, second = (("x", "y", "optical")[i] for i in sorted(order[:2]))
         return f"an axis between the camera's {first} and {second} axes"
     return "an axis oblique to all camera axes"
