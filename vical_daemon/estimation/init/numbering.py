@@ -32,7 +32,6 @@ _TOGETHER_S = 0.05
 _NEXT_NS = 400_000_000  # a hand turns a camera by less than 90 degrees in 0.4 s, as the detector assumes
 _CLEARLY = 0.5
 """The other numbering moves the points by less than half as much: they jump by half the board."""
-_BEHIND_S = 0.1  # readings may end so much before an image: 30 degrees at 5 rad/s
 
 
 class Turned(NamedTuple):
@@ -175,7 +174,7 @@ class HalfTurns:
         camera = f.state.cameras[frame.camera]
         t_s = t_cam_s + camera.timeshift_s
         until_s = min(t_s, buffer.newest_s)
-        if t_s - until_s > _BEHIND_S or until_s < f.state.t_s or buffer.gap_within(f.state.t_s, until_s):
+        if until_s < f.state.t_s or buffer.gap_within(f.state.t_s, until_s):
             return False
         segment = buffer.segment(f.state.t_s, until_s)
         if segment is None:
