@@ -37,7 +37,6 @@ _MOST_SIGMA_PX = 3.0  # noise of a track beyond which a window has failed; usual
 _MOST_INERTIAL = 2.5  # likewise, rms of the inertial residuals in their sigmas
 _MOST_REFUSED = 0.4  # likewise, share of the sightings left out: with half, either half may be right
 _LEARNING = 4  # windows
-_MOST_FACTOR = 100.0  # of the variance: sigmas ten times too small are no scatter but a change
 _MOUNTING_IN_DOUBT = "the mounting still moves: waiting to see whether the camera was moved"
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
@@ -312,10 +311,6 @@ class TargetFreeStatus(Evaluator):
         pause = "" if running else f" (paused: {self.reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
-            if self.proven and self.factor() > _MOST_FACTOR:
-                return Verdict(
-                    Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say"
-                )
             return self._once_known(enough=self.proven, doubt=doubt, pause=pause)
         if lens_alone:
             return lens_verdict(missing[0], self.camera, off=self.models.lens_off)
