@@ -43,7 +43,6 @@ from vical_daemon.estimation.wording import not_in_view
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
 SHIFT_VARIES = "the time shift varies within seconds: fix the exposure time, or stamp the middle of exposures"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
-_NIS_BAD = 4.0  # mean square of the innovations: sigmas are half of what they should be
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
 _KEPT_CHECKS = round(3600.0 / HELD_BACK_EVERY_S)  # of an hour
 _ACROSS, _DOWN = (2 * n for n in PATCHES)  # parts of the picture
@@ -315,8 +314,6 @@ class StatusEvaluator(Evaluator):
         refused = self._recent_used.count(False)
         if len(self._recent_used) >= 20 and refused > len(self._recent_used) // 3:
             return f"{refused} of the last {len(self._recent_used)} images do not fit the motion"
-        if len(self._squares) >= 40 and self.nis_per_dof() > _NIS_BAD:
-            return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
 
 
