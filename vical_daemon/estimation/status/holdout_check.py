@@ -22,9 +22,6 @@ HELD_BACK_EVERY_S = 5.0 * _AHEAD_S  # between two predictions, so that they shar
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
 _CLIP = 10.0  # that one prediction counts
-_FITS = 2.0
-"""Corner scale above which it is the images that do not fit. Where their errors last, predictions may be off
-by these, too: on EuRoC by 1.6 times. White noise that the readings show is then not in doubt."""
 
 
 @dataclass(slots=True)
@@ -82,14 +79,15 @@ def imu_noise_error(ratios: Sequence[float], f: CalibrationFilter, camera: str) 
 
     Args:
         ratios: What `HoldoutCheck.follow` returned lately.
-        f: The filter; with images that do not fit nothing can be said.
+        f: The filter. Where errors of its images last, predictions may be off by these, too: on EuRoC by 1.6
+            times. White noise that the readings show is then not in doubt.
         camera: Which showed the last of them.
 
     Returns:
         Errors of the predictions over the expected ones (1: as expected), where they differ.
     """
     known, lasting = isinstance(f.imu_noise, MeasuredNoise), f.consistency[camera].factor > 1.0
-    if len(ratios) < _ENOUGH or f.consistency[camera].scale > _FITS or (known and lasting):
+    if len(ratios) < _ENOUGH or (known and lasting):
         return None
     mean = float(np.mean(np.minimum(ratios, _CLIP)))
     if _BETTER <= mean <= _WORSE:
