@@ -26,7 +26,6 @@ MIN_PAIRS = 8  # 24 equations for mounting, bias and delay; as many orientations
 # touched by outliers, by the gyro's bias and by holes; each doubling doubles the turn over the same noise.
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)
 _DISTINCT = 10.0  # ratio of a usual turn to its noise
-_LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
 _MAX_PAIRS = 300  # for the start, which needs no more; the polish takes all orientations
 _LOW = 0.05  # quantile of third differences that shows their noise: outliers are above
 _SLOWEST_S = 0.11  # at less than 9 Hz third differences of a hand's motion exceed any noise
@@ -105,10 +104,7 @@ def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_
         moving = _moving(t_cam_s, turns, noise)
         if np.count_nonzero(moving) < MIN_PAIRS:
             continue
-        usual = float(np.median(turns.angle[moving]))
-        if best is not None and usual > _LONGEST_TURN_RAD:
-            break
-        ratio = usual / max(_turn_noise(noise), 1e-12)
+        ratio = float(np.median(turns.angle[moving])) / max(_turn_noise(noise), 1e-12)
         if best is None or ratio > best[0]:
             best = ratio, turns, moving
         if ratio > _DISTINCT:
