@@ -19,7 +19,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, huber_weight
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, huber_weight
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left, moves
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior, calibration_difference, carried_out
@@ -34,7 +34,6 @@ _DAMPING = 1e-12
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _BOUNDS = 0.2, 5.0  # of an inverse distance after a step, over that before it
-_ROUNDS = 4  # of looking for distances that a step would move beyond their bounds
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the offsets of images that are allowed for: so much does not end a window
 _LESS = 1.1  # of the noise of features, over what is measured now: then a window goes on with that
@@ -138,11 +137,11 @@ class Bundle:
         """Iterate until nothing changes or `most` steps are done; None where it does not hold together."""
         w, now = self.window, self._present()
         for steps in range(1, most + 1):
-            step = None if now is None else self._step(now.normal, now.damping, _ROUNDS if now.cleaned else 1)
+            step = None if now is None else self._step(now.normal, now.damping, settle=now.cleaned)
             if now is None or step is None:
                 return None
             if now.cleaned and now.damping > _DAMPING and step.predicted_reduction < DONE:
-                bare = self._step(now.normal, _DAMPING, _ROUNDS)  # with damping, little is predicted
+                bare = self._step(now.normal, _DAMPING, settle=True)  # with damping, little is predicted
                 if bare is not None and bare.predicted_reduction >= DONE:
                     self._tried(now, step)
                     now = self._relinearised(now, buffer)
@@ -252,7 +251,7 @@ class Bundle:
             return None
         return None if info else root
 
-    def _step(self, normal: Normal, lam: float, rounds: int) -> _Step | None:
+    def _step(self, normal: Normal, lam: float, *, settle: bool) -> _Step | None:
         """Step of states and landmarks; None where the matrix is not positive.
 
         No distance may go beyond infinity, nor change by more than `_BOUNDS` in a step. One that would is
@@ -262,14 +261,14 @@ class Bundle:
         Args:
             normal: About the present values.
             lam: Damping, of the diagonal.
-            rounds: Of looking for distances beyond their bounds; those of the last are only cut off. Far from
-                the solution one: what is left of the step lowers the squares all the same.
+            settle: Look for distances beyond their bounds until there are no more. Else once, and what is
+                beyond then is cut off: far from the solution such a step lowers the squares all the same.
         """
         inverse = self.window.landmarks.inverse
         low = np.where(inverse < _FAR, 0.0, (_BOUNDS[0] - 1.0) * inverse)
         high = (_BOUNDS[1] - 1.0) * inverse + 10.0 * _FAR
         change = np.where((inverse < _FAR) & (normal.gl[:, 2] > 0.0), 0.0, np.nan)
-        for _ in range(rounds):
+        for _ in range(MOST_STEPS if settle else 1):
             step = self._unbounded(*self._displaced(normal, change), lam)
             if step is None:
                 return None

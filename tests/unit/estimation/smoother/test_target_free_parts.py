@@ -264,7 +264,7 @@ def test_a_step_is_the_best_within_the_bounds_of_the_distances(scene):
     seen = window.observe()
     window.landmarks.inverse[::3] = 0.01  # 100 m, of a room of 6 m
     normal, order = bundle.problem.normal(bundle.problem.view(seen)), bundle.problem.order()
-    step = bundle._step(normal, 0.0, 4)
+    step = bundle._step(normal, 0.0, settle=True)
     n, marks = len(normal.g), len(normal.gl)
     pixels = np.concatenate([order.frames[:, :6].ravel(), order.camera])
     M = np.zeros((n + 3 * marks, n + 3 * marks))

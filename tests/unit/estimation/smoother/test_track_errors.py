@@ -29,7 +29,7 @@ def scatter(bundle, memory):
         uv = view.uv + problem.noise.sigma_px * drawn(rng, view.seen, memory)
         seen = view._replace(seen=view.seen._replace(uv=uv))
         normal = problem.normal(seen)
-        found.append(bundle._step(normal, 0.0, 1).states[at])
+        found.append(bundle._step(normal, 0.0, settle=False).states[at])
         if draw % 4 == 0:
             root = bundle._root(normal)
             L = np.tril(root[order.tail :, order.tail :])
