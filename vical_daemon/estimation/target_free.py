@@ -28,6 +28,7 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_limit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck
@@ -56,7 +57,6 @@ MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
 WINDOW_S = 6.0  # likewise, see `WINDOW_FRAMES`
 _KEEP_S = 2.0 * WINDOW_S  # of images that wait for a start or for inertial data
-_LATE_S = 0.02  # inertial data must reach this far beyond an image
 _ALWAYS = frozenset({IMU, LAG, SIZE_EFFECT, "readout"})  # is estimated besides what is asked for
 
 
@@ -206,7 +206,7 @@ class TargetFreeCalibrator:
 
     def _ready(self, window: Window) -> Ready:
         """Images that inertial data cover, at most a step's worth, up to the first gap."""
-        end_s = self._buffer.settled_s - window.shift_s - _LATE_S
+        end_s = self._buffer.settled_s - window.shift_s - WINDOW_START.readout_s
         found = ready(self._pending, window.frames[-1][0], end_s)
         if found.hole_s:
             self._lost(Cause.NO_IMAGES, float(found.hole_s), keep=True)
@@ -224,7 +224,7 @@ class TargetFreeCalibrator:
     # ------------------------------------------------------------------ start
     def _try_start(self, flush: bool) -> bool:
         """Attempt to start from what waits; True when there is a window now."""
-        end = self._buffer.settled_s - _LATE_S
+        end = self._buffer.settled_s - WINDOW_START.readout_s
         known = self.latest
         self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
         hint = None if self._anew else known
