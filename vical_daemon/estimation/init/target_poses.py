@@ -19,8 +19,6 @@ from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.temporal.camera_orientations import CORNER_PX
 
-_CLEANINGS = 3  # a gross outlier may hide lesser ones
-
 
 @dataclass(slots=True)
 class TargetPose:
@@ -63,7 +61,7 @@ def poses_of(
     left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= MIN_POINTS]
     views = dict(zip(left, ideal_views([frames[k][1] for k in left], lens, target), strict=True))
     found: dict[int, PlanarPoses] = {}
-    for _ in range(1 + _CLEANINGS):
+    while left:  # a gross outlier may hide lesser ones
         found.update(zip(left, planar_poses(*_columns([views[k] for k in left])), strict=True))
         left = [k for k in left if found[k].candidates and _cleaned(views, k, found[k].candidates[0])]
     return [
