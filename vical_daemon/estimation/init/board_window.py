@@ -52,13 +52,10 @@ from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mc
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
+LATE_S = 2e-3  # images less apart share the motion of one instant: a pose is moved there
 _EDGE_S = (
     AGAIN_SIGMAS * 2.0 * SHIFT_SIGMA_S
 )  # by which the time shift may still move: five sigmas of the least a start is made with
-
-
-LATE_S = 2e-3
-"""Images less apart, s, share the motion of one instant: the pose is moved from one to the other."""
 
 
 @dataclass(slots=True)
