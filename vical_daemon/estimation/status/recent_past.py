@@ -32,6 +32,7 @@ from vical_daemon.estimation.temporal.shift_step import (
 
 BEFORE_S = 3.0  # a change is noticed within
 _STRETCHES = (10, 15, 30)  # images in which a step is looked for; the most show how well they usually fit
+_LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
 _MOST = 200  # images kept, a camera
 
 _Poses = dict[float, TargetPose | None]
@@ -112,7 +113,7 @@ class RecentPast:
         for count in _STRETCHES:
             if len(frames) < count:
                 break
-            fit = self.shift_of(frames[-count:], f, buffer, target, poses, sound_s)
+            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target, poses, sound_s)
             if fit is not None and fit.stepped:
                 return fit
         return None
