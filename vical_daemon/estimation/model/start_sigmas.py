@@ -60,15 +60,10 @@ def start_sigmas(
 
 def _of_lens(camera: CameraState, start: StartSigmas) -> FloatArray:
     """Of fx fy cx cy and the distortion, shape (n,)."""
-    pinhole = np.repeat([start.focal, start.centre], 2) * float(camera.intrinsics[0])
-    distortion = distortion_sigmas(camera.distortion_model, len(camera.distortion), start)
-    return np.concatenate([pinhole, distortion])
-
-
-def distortion_sigmas(model: str, n: int, start: StartSigmas) -> FloatArray:
-    """Of `n` coefficients of a distortion model, shape (n,)."""
-    if model == EQUIDISTANT:
-        return np.full(n, start.equidistant)
-    s = np.full(n, start.distortion)
-    s[2:4] = start.tangential
+    s = np.full(4 + len(camera.distortion), start.distortion)
+    s[:2], s[2:4] = np.array([start.focal, start.centre]) * float(camera.intrinsics[0])
+    if camera.distortion_model == EQUIDISTANT:
+        s[4:] = start.equidistant
+    else:
+        s[6:8] = start.tangential
     return s

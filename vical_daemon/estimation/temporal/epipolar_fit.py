@@ -21,7 +21,6 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, 
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.inertial_links import DONE
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS, WINDOW_START
-from vical_daemon.estimation.model.start_sigmas import distortion_sigmas
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.significance import STRETCH_S
 from vical_daemon.estimation.temporal.epipolar_errors import (
@@ -36,7 +35,13 @@ from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S, Pairs, make_
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18  # steps, at most: five with a wide gate, five with the lens as given, then to convergence
-_FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003  # what focal length and its ratio may be off by, relative
+# What a lens may be off by: focal length and its ratio (relative), distortion.
+_FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
+_DISTORTION_SIGMA = {
+    "radtan": (0.1, 0.1, 0.005, 0.005),
+    "plumb_bob": (0.1, 0.1, 0.005, 0.005, 0.1),
+    "equidistant": (0.05, 0.05, 0.05, 0.05),
+}
 _LENS_AFTER = 4  # iterations with the lens as given
 _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
@@ -235,7 +240,7 @@ class _Fit:
         P = np.zeros((len(g) - 7,) * 2)
         P[:2, :2] = focal / f**2
         P[2:4, 2:4] = np.eye(2) / (WINDOW_START.centre * f) ** 2
-        P[4:, 4:] = np.diag(distortion_sigmas(self.model, len(self.distortion), WINDOW_START) ** -2.0)
+        P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
         P *= self.lasting
         off = np.concatenate([self.intrinsics - self.given[0], self.distortion - self.given[1]])
         H[7:, 7:] += P
