@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.curves import Pause
 from vical_mocks.harness.feed import (
     CalibratorSubject,
     StartErrors,
@@ -99,6 +100,21 @@ def test_stamps_that_jitter_are_noticed_and_allowed_for(jitter_s):
         < 1.5 * jitter_s
     )
     assert len([e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]) == (jitter_s == 1e-3)
+
+
+def test_images_that_shake_while_the_rig_comes_to_rest_are_not_called_late():
+    """Images that shake by 0.1 px, at rest from 18 to 28 s: "stamps jitter by 1.1 ms" (or by 94)."""
+    run, known = draw(6, 60.0, target_free=True, change=lambda rig: at_rest(rig, Pause(18.0, 28.0)))
+    prior = camera_prior(run, 6, StartErrors(), exact_lens=known)
+    fix = frozenset({"intrinsics"} if known else ())
+    options = CalibrationOptions(fix=fix, target_free=True, imu_noise=imu_noise(run))
+    record = feed(run, CalibratorSubject(options, prior, None), until_s=33.0)
+    assert len(record.snapshots) > 20
+    assert not [e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]
+
+
+def at_rest(rig, *pauses):
+    return replace(rig, trajectory=rig.trajectory.with_pauses(pauses))
 
 
 def test_good_stamps_are_believed(followed):
