@@ -388,7 +388,7 @@ class TargetFreeCalibrator:
             self.latest, self._noise = fit.carry, fit.noise
         self._closed += 1
         self.evaluator.closed()
-        if self.evaluator.moved(fit.carry):
+        if self.evaluator.moved():
             self._forget()
             return
         self._learn_lens(window, bundle, fit)

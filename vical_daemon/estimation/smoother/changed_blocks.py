@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import combinations
+from itertools import accumulate, combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.retract import camera_difference
 from vical_daemon.estimation.model.state import CameraSlices, CameraState, Layout
-from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, PERHAPS_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 _WINDOWS = 5
 """Estimates looked back at: some 15 s. After as long, a move is a change like any other: windows disagree."""
@@ -107,26 +108,35 @@ def square_of_change(change: FloatArray, before: FloatArray, after: FloatArray) 
     return float((d[informed] ** 2 / values[informed]).sum()), int(np.count_nonzero(informed))
 
 
+class _Mounting(NamedTuple):
+    """What was reported: the calibration, its covariance over its factor, by which models."""
+
+    camera: CameraState
+    covariance: FloatArray
+    models: object
+
+
 class MountingWatch:
     """Notices a mounting that moved by less than one window shows, from estimates some windows apart.
 
-    Lever arm and mounting, each as a whole, are compared with those of the last windows. For consistent
-    sigmas cov(new - old) = P_old - P_new, however many windows lie between them.
+    Lever arm and mounting, each as a whole, are compared with those after the last complete windows. For
+    consistent sigmas cov(new - old) = P_old - P_new, however many windows lie between them.
     [Hausman, "Specification tests in econometrics", 1978; docs/math/target_free.md, "Changes"]
 
     Attributes:
-        doubtful: One of them may have moved.
+        doubtful: One of them may have moved, until a complete window shows that it has not.
+        surely: One of them surely has.
     """
 
     def __init__(self) -> None:
-        self.doubtful = False
-        self._models: object = None
-        self._past: deque[tuple[CameraState, FloatArray]] = deque(maxlen=_WINDOWS)
+        self.doubtful = self.surely = self._doubted = False
+        self._newest: _Mounting | None = None
+        self._past: deque[_Mounting] = deque(maxlen=_WINDOWS)
 
-    def moved(
+    def compare(
         self, camera: CameraState, covariance: FloatArray, factor: float, where: CameraSlices, models: object
-    ) -> bool:
-        """Take what is reported after a complete window; whether lever arm or mounting have surely moved.
+    ) -> None:
+        """Take what is reported now.
 
         Args:
             camera: The calibration.
@@ -135,18 +145,38 @@ class MountingWatch:
             where: Where the errors of the camera live.
             models: What is taken to be as specified: with other models the answer is another one.
         """
-        if models != self._models:
-            self._past.clear()
-            self._models = models
-        self.doubtful = surely = False
-        for old, before in self._past:
-            d = camera_difference(camera, old, where, len(covariance))
+        self.surely = self._doubted = False
+        self._newest = _Mounting(camera, covariance, models)
+        for old in self._past:
+            if old.models != models:
+                continue
+            d, before = camera_difference(camera, old.camera, where, len(covariance)), old.covariance
             for block in (where.position, where.rotation):
                 if block is None:
                     continue
                 square, dof = square_of_change(d[block], before[block, block], covariance[block, block])
                 if dof:
-                    self.doubtful |= square > factor * chi_square_limit(dof, LIKELY_SIGMAS)
-                    surely |= square > factor * chi_square_limit(dof, SURE_SIGMAS)
-        self._past.append((camera, covariance))
-        return surely
+                    self._doubted |= square > factor * chi_square_limit(dof, LIKELY_SIGMAS)
+                    self.surely |= square > factor * chi_square_limit(dof, SURE_SIGMAS)
+        self.doubtful |= self._doubted
+
+    def window_done(self) -> None:
+        """What was compared last is out of a complete window: later ones are held against it."""
+        self.doubtful = self._doubted
+        if self._newest is not None:
+            self._past.append(self._newest)
+
+
+def newest_disagree(windows: Sequence[tuple[float, int]], factor: float) -> bool:
+    """Whether the newest windows, one to five, moved the calibration by more than chance.
+
+    Each by itself may agree with what was known, and all of them to one side.
+
+    Args:
+        windows: Sum of squares of each change and its degrees of freedom, from the oldest on.
+        factor: Measured variance over the stated one.
+    """
+    newest = accumulate(
+        reversed(list(windows)[1:][-_WINDOWS:]), lambda both, one: (both[0] + one[0], both[1] + one[1])
+    )
+    return any(square > factor * chi_square_limit(dof, PERHAPS_SIGMAS) for square, dof in newest)

@@ -19,11 +19,12 @@ from vical_daemon.estimation.selection.model_selection import IMU
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.changed_blocks import MountingWatch, square_of_change
+from vical_daemon.estimation.smoother.changed_blocks import MountingWatch, newest_disagree, square_of_change
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
+    STANDS_S,
     Evaluator,
     Verdict,
     lacking_verdict,
@@ -38,6 +39,7 @@ _MOST_INERTIAL = 2.5  # likewise, rms of the inertial residuals in their sigmas
 _MOST_REFUSED = 0.4  # likewise, share of the sightings left out: with half, either half may be right
 _LEARNING = 4  # windows
 _MOUNTING_IN_DOUBT = "the mounting still moves: waiting to see whether the camera was moved"
+_NEWEST_IN_DOUBT = "the last seconds agree less than usual: waiting to see whether something has changed"
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
@@ -171,6 +173,10 @@ class TargetFreeStatus(Evaluator):
         self._pixels.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))
+        models = self.models.weighed(fit.carry, self.factor(), bool(self._squares))
+        camera, S = models.averaged
+        likely = max(models.weights, key=lambda name: models.weights[name])
+        self._mounting.compare(camera, S @ S.T, self.factor(), self.layout.camera, likely)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
@@ -188,14 +194,12 @@ class TargetFreeStatus(Evaluator):
         self._against_since_s = None
         self._announce_jitter(self.camera, self.jitter_s)
 
-    def moved(self, carry: MarginalPrior) -> bool:
-        """Whether a complete window shows, with those before it, that the mounting has moved."""
+    def moved(self) -> bool:
+        """Whether a window that is complete now shows, with those before it, that the mounting has moved."""
         if self._windows < _LEARNING:
             return False
-        models = self.models.weighed(carry, self.factor(), bool(self._squares))
-        camera, S = models.averaged
-        likely = max(models.weights, key=lambda name: models.weights[name])
-        return self._mounting.moved(camera, S @ S.T, self.factor(), self.layout.camera, likely)
+        self._mounting.window_done()
+        return self._mounting.surely
 
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
@@ -269,9 +273,11 @@ class TargetFreeStatus(Evaluator):
             lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
             doubt = self.models.reason(carry, self.factor(), believed=self.believed)
             doubt = doubt or (CLOCKS_IN_DOUBT if self._clock_wanders else "")
-            doubt = doubt or (_MOUNTING_IN_DOUBT if self._mounting.doubtful else "")
-            self.believed &= not doubt
-            reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
+            changed = self._newest_in_doubt()
+            self.believed &= not (doubt or changed)
+            stood_s = STANDS_S if changed else 0.0  # windows are longer than that
+            verdict = self._decide(running, weak, doubt or changed, stood_s, lens_alone=lens_alone)
+            reported = self._followed(verdict, *at)
             cameras, missing = {self.camera: camera}, {self.camera: weak}
             imu = imu_estimate(carry, matrices=IMU in self.models.asked, positions=self.models.axes_apart)
         refused, seen = (sum(x) for x in zip((0, 0), *self._refused, strict=True))
@@ -286,6 +292,12 @@ class TargetFreeStatus(Evaluator):
             refused=refused / max(seen, 1),
         )
 
+    def _newest_in_doubt(self) -> str:
+        """What the newest windows contradict, if all of them together do, in words; empty: nothing."""
+        if self._mounting.doubtful:
+            return _MOUNTING_IN_DOUBT
+        return _NEWEST_IN_DOUBT if newest_disagree(self._squares, self.factor()) else ""
+
     def _camera(self, carry: MarginalPrior, newest_s: float = -np.inf) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._pixels), sum(n for _, n in self._pixels)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
@@ -294,7 +306,13 @@ class TargetFreeStatus(Evaluator):
         return camera_estimate(models, self._sigma_px, rms_px, self.held, later_s)
 
     def _decide(
-        self, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool
+        self,
+        running: bool,
+        missing: list[WeakDirection],
+        doubt: str,
+        doubted_s: float,
+        *,
+        lens_alone: bool,
     ) -> Verdict:
         """By the data up to now.
 
@@ -302,6 +320,7 @@ class TargetFreeStatus(Evaluator):
             running: Images are being used.
             missing: Directions that are not known well enough.
             doubt: What may not be as it is taken to be, or nothing.
+            doubted_s: For how long the data speak for that, s.
             lens_alone: Nothing would be missing if the fixed lens were known.
         """
         if not running and self._windows == 0:
@@ -311,7 +330,7 @@ class TargetFreeStatus(Evaluator):
         pause = "" if running else f" (paused: {self.reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
-            return self._once_known(enough=self.proven, doubt=doubt, pause=pause)
+            return self._once_known(enough=self.proven, doubt=doubt, pause=pause, doubted_s=doubted_s)
         if lens_alone:
             return lens_verdict(missing[0], self.camera, off=self.models.lens_off)
         return lacking_verdict(missing, shown_s=self._now_s - (self._started_s or 0.0), pause=pause)

@@ -25,7 +25,7 @@ from vical_daemon.estimation.status.excitation import (
 from vical_daemon.estimation.status.reading_sample import ReadingSample
 from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
 
-_STANDS_S = 2.0
+STANDS_S = 2.0
 """For so long the data must speak against a converged calibration before it is called converging again, s of
 data: twice the second over which noise moves what the evaluators look at."""
 _HYSTERESIS = 2.0
@@ -91,7 +91,7 @@ class SteadyStatus:
         if self.status is Status.CONVERGED and verdict.status is Status.CONVERGING:
             if self._doubted_s is None:
                 self._doubted_s = now_s - verdict.against_s
-            if now_s - self._doubted_s < _STANDS_S:
+            if now_s - self._doubted_s < STANDS_S:
                 return Verdict(Status.CONVERGED)
         self.reset(verdict.status)
         return verdict
@@ -272,16 +272,17 @@ class Evaluator:
         return unit_mistake(ImuArrays(np.array(t_ns), np.array(gyro), np.array(accel)))
 
     @staticmethod
-    def _once_known(*, enough: bool, doubt: str, pause: str = "") -> Verdict:
+    def _once_known(*, enough: bool, doubt: str, pause: str = "", doubted_s: float = 0.0) -> Verdict:
         """The verdict where all directions are known well enough.
 
         Args:
             enough: There are data enough to confirm them.
             doubt: What may not be as it is taken to be; empty: nothing.
             pause: As for `lacking_verdict`.
+            doubted_s: For how long the data speak for the doubt, s.
         """
         if not enough or doubt:
-            return Verdict(Status.CONVERGING, (doubt if enough else CONFIRMING) + pause)
+            return Verdict(Status.CONVERGING, (doubt if enough else CONFIRMING) + pause, against_s=doubted_s)
         return Verdict(Status.CONVERGED, pause.strip(" ()"))
 
     def _put_together(

@@ -12,7 +12,11 @@ from tests.unit.estimation.smoother.test_changes import followed
 from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.changed_blocks import MountingWatch, square_of_change
+from vical_daemon.estimation.smoother.changed_blocks import (
+    MountingWatch,
+    newest_disagree,
+    square_of_change,
+)
 
 WINDOW_SIGMA_M = 2e-3  # of one window alone
 CAMERA = CameraState(
@@ -34,6 +38,13 @@ def estimates(seed, count, move_m=0.0, at=0):
     return out, where
 
 
+def moved(watch, camera, P, where, models="all"):
+    """After a complete window: whether the mounting surely moved."""
+    watch.compare(camera, P, 1.0, where, models)
+    watch.window_done()
+    return watch.surely
+
+
 def test_the_square_of_an_honest_change_is_chi_square():
     squares = []
     for seed in range(400):
@@ -46,21 +57,21 @@ def test_the_square_of_an_honest_change_is_chi_square():
 
 
 def test_honest_estimates_are_never_surely_moved_and_rarely_doubted():
-    moved, doubted = 0, 0
+    surely, doubted = 0, 0
     for seed in range(100):
         watch = MountingWatch()
         shots, where = estimates(seed, 30)
         for camera, P in shots:
-            moved += watch.moved(camera, P, 1.0, where, "all")
+            surely += moved(watch, camera, P, where)
             doubted += watch.doubtful
-    assert moved == 0
+    assert surely == 0
     assert doubted <= 6  # of 3000, five comparisons each at 6e-5: 0.9 are expected
 
 
 @pytest.mark.parametrize(("move_m", "windows"), [(0.02, 1), (0.01, 4)])
 def test_a_move_is_noticed_after_some_windows(move_m, windows):
     watch, (shots, where) = MountingWatch(), estimates(3, 20, move_m, at=10)
-    surely = [watch.moved(camera, P, 1.0, where, "all") for camera, P in shots]
+    surely = [moved(watch, camera, P, where) for camera, P in shots]
     assert not any(surely[:10])
     assert any(surely[10 : 10 + windows])
 
@@ -68,8 +79,36 @@ def test_a_move_is_noticed_after_some_windows(move_m, windows):
 def test_answers_with_other_models_are_not_compared():
     watch, (shots, where) = MountingWatch(), estimates(3, 12, 0.02, at=11)
     for k, (camera, P) in enumerate(shots):
-        assert not watch.moved(camera, P, 1.0, where, "imu off" if k == 11 else "all")
+        assert not moved(watch, camera, P, where, "imu off" if k == 11 else "all")
     assert not watch.doubtful
+
+
+def test_a_window_that_still_grows_is_held_against_complete_ones_only():
+    watch, (shots, where) = MountingWatch(), estimates(3, 12, 0.02, at=11)
+    for camera, P in shots[:-1]:
+        assert not moved(watch, camera, P, where)
+    for _ in range(3):
+        watch.compare(*shots[-1], 1.0, where, "all")
+        assert watch.doubtful
+    watch.compare(*shots[-2], 1.0, where, "all")  # other images turned out to be outliers
+    assert watch.doubtful
+    watch.window_done()
+    assert not watch.doubtful
+
+
+def test_windows_that_agree_are_rarely_in_doubt_and_a_few_that_all_disagree_a_little_are():
+    rng, dof = np.random.default_rng(5), 20
+    honest = [[(s, dof) for s in rng.chisquare(dof, 8)] for _ in range(2000)]
+    doubted = np.mean([newest_disagree(windows, max(1.0, mean_of(windows))) for windows in honest])
+    assert doubted < 0.01  # five sums, each at 3e-3
+    windows = [(20.0, dof)] * 7 + [(38.0, dof)] * 2
+    assert not any(newest_disagree(windows[:k], 1.0) for k in range(9))  # 38: 9e-3
+    assert newest_disagree(windows, 1.0) and not newest_disagree(windows, 1.2)  # windows of this rig disagree
+    assert not newest_disagree([(60.0, dof)], 3.0)  # nothing to compare the first one with
+
+
+def mean_of(windows):
+    return sum(square for square, _ in windows) / sum(dof for _, dof in windows)
 
 
 @pytest.mark.parametrize("seed", [11, 12])
