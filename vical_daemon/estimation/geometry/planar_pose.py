@@ -24,7 +24,7 @@ from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
-MIN_POINTS = 8  # of a view: two tags, or corners enough to see an outlier among them
+MIN_POINTS = 4  # of a view: as many as its pose needs
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4  # both poses of a plane have become one: far below the noise of any view
@@ -105,13 +105,13 @@ def planar_poses(
     """Find the poses of a planar target from undistorted image points, in each of several views.
 
     Args:
-        points_m: By view, points in the target frame with z = 0, m, shape (n, 3) or (n, 2), n >= 4.
+        points_m: By view, points in the target frame with z = 0, m, shape (n, 3) or (n, 2).
         xy: Likewise, undistorted normalised coordinates X/Z, Y/Z, shape (n, 2).
         sigma: Noise of xy per axis (pixels / fx); None: taken from the residuals of the best pose.
 
     Returns:
         By view, up to two poses, best first; a second that is clearly worse is refined only so far that this
-        is sure. None where the points are too few, on a line or behind the camera.
+        is sure. None where there are fewer than four points, or they are on a line or behind the camera.
     """
     if not len(xy):
         return []
@@ -120,7 +120,7 @@ def planar_poses(
         return [found for part in parts for found in planar_poses(points_m[part], xy[part], sigma)]
     views = _Views.of(points_m, xy)
     out = [PlanarPoses(()) for _ in xy]
-    left = np.flatnonzero(views.points >= 4)
+    left = np.flatnonzero(views.points >= MIN_POINTS)
     extent = np.linalg.eigvalsh(views.plane[left] @ np.swapaxes(views.plane[left], 1, 2))
     left = left[extent[:, 0] > _COLLINEAR**2 * extent[:, 1]]
     H, found = _homographies(views.only(left))

@@ -58,8 +58,8 @@ def poses_of(
     frames: Sequence[tuple[float, PointsFrame]], lens: CameraState, target: FloatArray
 ) -> list[TargetPose | None]:
     """Planar poses of frames with their stamps in s, see `pose_of`."""
-    left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= MIN_POINTS]
-    views = dict(zip(left, ideal_views([frames[k][1] for k in left], lens, target), strict=True))
+    views = dict(enumerate(ideal_views([f for _, f in frames], lens, target)))
+    left = list(views)
     found: dict[int, PlanarPoses] = {}
     while left:  # a gross outlier may hide lesser ones
         found.update(zip(left, planar_poses(*_columns([views[k] for k in left])), strict=True))

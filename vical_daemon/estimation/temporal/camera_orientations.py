@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, PlanarPose, PlanarPoses, planar_poses
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_poses
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
 
@@ -89,9 +89,8 @@ def _planar(
     for frame in frames:
         known = (frame.ids >= 0) & (frame.ids < len(points_m))
         xy, ok = undistort(frame.uv_px[known], *lens)
-        enough = ok.sum() >= MIN_POINTS
-        points.append(points_m[frame.ids[known][ok]] if enough else np.zeros((0, 3)))
-        rays.append(xy[ok] if enough else np.zeros((0, 2)))
+        points.append(points_m[frame.ids[known][ok]])
+        rays.append(xy[ok])
     return planar_poses(points, rays, sigma)
 
 

@@ -20,6 +20,7 @@ from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.target_poses import pose_of
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.state import GRAVITY
+from vical_daemon.vision.target import AprilGrid
 
 
 def answer(run, *, lens_known):
@@ -45,6 +46,15 @@ def test_a_board_that_stands_upright_and_is_turned(lean_deg):
     within(record, 4.0)
     error = np.linalg.norm(calibrator.filter.state.gravity - down)
     assert error < 4.0 * np.linalg.norm(calibrator.filter.sigmas()[GRAVITY])
+
+
+def test_a_single_tag_is_a_target():
+    tag = board_points(2, 2, 0.16)
+    rig = rig_before(AprilGrid(1, 1, 0.16, 0.3), 0.5, 5)
+    run = simulate(5, 10.0, rig=rig, points_m=tag, corner_sigma_px=0.2)
+    record, _ = answer(run, lens_known=False)
+    assert record.started_s() <= 7.0
+    within(record, 4.0, parameters=15)
 
 
 def test_a_small_board_a_hand_away():
