@@ -13,6 +13,7 @@ from vical_mocks.camera import PoseFunction, pixel_rays
 from vical_mocks.lens import Lens
 
 FloatArray = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating]
 Image = npt.NDArray[np.uint8]
 
 
@@ -32,21 +33,22 @@ class Panel:
     size_m: tuple[float, float]
     texel_m: float
 
-    def to_plane(self, p_world: FloatArray, rays_world: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where rays from a point meet the panel: coordinates on it (m) and distance along the ray.
+    def to_plane(self, p_world: FloatArray, rays_world: Floats) -> tuple[Floats, Floats, Floats]:
+        """Where rays (..., 3) from a point meet the panel: coordinates on it (m), and distance along the ray.
 
         The distance is inf where the ray misses the rectangle or points away.
         """
         normal = np.cross(self.axes[0], self.axes[1])
-        slope = rays_world @ normal
+        frame = np.array([normal, *self.axes])
+        begin = frame @ (p_world - self.origin_m)
+        along = frame.astype(rays_world.dtype) @ rays_world.reshape(-1, 3).T
+        slope, right, down = along.reshape(3, *rays_world.shape[:-1])
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = ((self.origin_m - p_world) @ normal) / slope
-            offset = (p_world - self.origin_m) @ self.axes.T
-            place = offset + distance[..., None] * (rays_world @ self.axes.T)
-            hit = (
-                (distance > 1e-3) & (place >= 0).all(axis=-1) & (place <= np.array(self.size_m)).all(axis=-1)
-            )
-        return place, np.where(hit, distance, np.inf)
+            distance = -begin[0] / slope
+            right, down = begin[1] + distance * right, begin[2] + distance * down
+            width, height = self.size_m
+            hit = (distance > 1e-3) & (right >= 0) & (right <= width) & (down >= 0) & (down <= height)
+        return right, down, np.where(hit, distance, np.inf)
 
 
 def room_panels(side: int = -1) -> list[Panel]:
@@ -123,7 +125,7 @@ class RoomCamera:
         """World points that pixels show at `t_s`, shape (n, 3); nan where a pixel shows nothing."""
         R, p = self._pose(np.array([t_s]))
         rays = self.lens.unproject(uv_px) @ R[0].T
-        distance = np.min([panel.to_plane(p[0], rays)[1] for panel in self._panels], axis=0)
+        distance = np.min([panel.to_plane(p[0], rays)[2] for panel in self._panels], axis=0)
         return np.asarray(p[0] + np.where(np.isfinite(distance), distance, np.nan)[:, None] * rays)
 
     def project(self, points_m: FloatArray, t_s: float) -> FloatArray:
@@ -138,14 +140,12 @@ class RoomCamera:
         nearest = np.full(self._blind.shape, np.inf, np.float32)
         picture = np.full(self._blind.shape, 60.0, np.float32)
         for panel, texture in zip(self._panels, self._textures, strict=True):
-            place, distance = panel.to_plane(p[0], rays)
+            right, down, distance = panel.to_plane(p[0], rays)
             front = distance < nearest
             if not front.any():
                 continue
-            texel = (np.nan_to_num(place / panel.texel_m, nan=-1.0, posinf=-1.0, neginf=-1.0) - 0.5).astype(
-                np.float32
-            )
-            seen = cv2.remap(texture, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            at = [np.where(front, m / panel.texel_m - 0.5, -1.0).astype(np.float32) for m in (right, down)]
+            seen = cv2.remap(texture, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             picture[front] = seen[front]
             nearest[front] = distance[front]
         picture[self._blind] = 0.0

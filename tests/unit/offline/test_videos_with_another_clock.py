@@ -26,7 +26,7 @@ from vical_daemon.vision.target import AprilGrid
 
 SMALL = Lens((260.0, 260.0, 160.0, 120.0), (0.0, 0.0, 0.0, 0.0), (320, 240))
 BOARD = "target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 0.055\ntagSpacing: 0.3\n"
-IMU_S, BEGIN_S, FPS = 150.0, 97.213, 15.0
+IMU_S, BEGIN_S, FPS = 80.0, 57.213, 15.0
 
 
 def recorded(folder, rig, camera, length_s, begin_s=BEGIN_S):
@@ -111,7 +111,7 @@ def test_a_part_without_images_is_named(before_a_board):
     folder, _, _ = before_a_board
     target = str(folder / "board.yaml")
     job = make_job(open_recording(folder), Initial(), target=target, seconds=30.0)
-    with pytest.raises(OptionError, match=r"has no images; they are from 97\.2 to 111\.\d s"):
+    with pytest.raises(OptionError, match=r"has no images; they are from 57\.2 to 71\.\d s"):
         run_job(job, lambda *_: None)
 
 
