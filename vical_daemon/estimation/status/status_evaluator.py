@@ -76,6 +76,7 @@ class StatusEvaluator(Evaluator):
         self._cover = Cover()
         self._before: dict[str, CameraEstimate] = {}  # from before a change, until it is known what changed
         self._named = True  # that a mounting changed has been announced
+        self._stepped: set[str] = set()  # cameras of which a step of the time shift was, since that change
 
     # ------------------------------------------------------------------ what happens
     def started(self, t_s: float, partial: str = "") -> None:
@@ -110,6 +111,7 @@ class StatusEvaluator(Evaluator):
         known = self.weighed(before)
         self._before = self._before or {name: self._camera(name, known) for name in _seen(known)}
         self._named = sure
+        self._stepped.clear()
         if self._named:
             self.announce_change(why)
 
@@ -217,9 +219,13 @@ class StatusEvaluator(Evaluator):
             lens[name] = lens_difference(name, before, now[name], self.elapsed_s)
         since_s = t_s - max(self._started_s or 0.0, self._reopened_s)
         # the first images after a change may not show yet that a lens explains them as well
-        if not self._named and not doubt and since_s >= EVERY_S and any(moved.values()):
-            self._named = True
-            self.announce_change(Cause.IMAGES_DISAGREE)
+        if not self._named and since_s >= EVERY_S:
+            kinds = {event.kind for events in moved.values() for event in events}
+            if kinds <= {EventKind.TIMESHIFT_CHANGED}:
+                self._clocks_stepped(moved)
+            elif not doubt:
+                self._named = True
+                self.announce_change(Cause.IMAGES_DISAGREE)
         visible_m = {name: visible_move_m(before, now[name]) for name, before in self._before.items()}
         well = since_s >= _ENOUGH_S or max(visible_m.values()) <= IRRELEVANT_M
         known = well and self.status == Status.CONVERGED
@@ -230,9 +236,17 @@ class StatusEvaluator(Evaluator):
             return
         if not any(moved.values()) and not any(lens.values()):
             self.announce_all(Event(EventKind.NOT_BUMPED, name, visible_m[name]) for name in moved)
-        for events in moved.values():
-            self.announce_all(events)
+        for name, events in moved.items():
+            told = name in self._stepped
+            self.announce_all(e for e in events if not (told and e.kind is EventKind.TIMESHIFT_CHANGED))
         self._before = {}
+
+    def _clocks_stepped(self, changed: dict[str, list[Event]]) -> None:
+        """Announce time shifts that differ where nothing else does; each once after a change."""
+        for name, events in changed.items():
+            if events and name not in self._stepped:
+                self._stepped.add(name)
+                self.announce(Event(EventKind.TIMESHIFT_STEPPED, name, events[0].value))
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
