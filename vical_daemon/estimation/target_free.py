@@ -205,7 +205,7 @@ class TargetFreeCalibrator:
         return reports
 
     def _ready(self, window: Window) -> Ready:
-        """Images that inertial data cover, at most a step's worth, up to the first gap."""
+        """Images about which a window finds readings, at most a step's worth, up to the first gap."""
         end_s = self._buffer.settled_s - window.shift_s - WINDOW_START.readout_s
         found = ready(self._pending, window.frames[-1][0], end_s)
         if found.hole_s:

@@ -161,7 +161,7 @@ class MountingWatch:
         self.doubtful |= self._doubted
 
     def window_done(self) -> None:
-        """What was compared last is out of a complete window: later ones are held against it."""
+        """The estimate compared last belongs to a complete window: later ones are compared with it, too."""
         self.doubtful = self._doubted
         if self._newest is not None:
             self._past.append(self._newest)
