@@ -77,3 +77,13 @@ def test_commands_and_studies_that_a_page_names_exist(page):
     assert commands <= set(table.available())
     studies = set(re.findall(r"python -m benchmarks ([a-z_]+)", text))
     assert studies <= {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_tables_are_whole(page):
+    """A blank line within a table makes the rest of it a paragraph; the second line rules off the titles."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for table_rows in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = table_rows.splitlines()
+        assert len(rows) > 1
+        assert re.fullmatch(r"\|[\s:|-]+\|", rows[1]), rows[0]
