@@ -21,4 +21,5 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"vical {release}"
 html_static_path = ["_static"]
+html_css_files = ["formulas.css"]
 html_copy_source = False
