@@ -27,7 +27,12 @@ from vical_daemon.estimation.filter.image_update import (
     whitened,
 )
 from vical_daemon.estimation.filter.jump_scores import JumpSizes
-from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
+from vical_daemon.estimation.filter.lever_arm_score import (
+    MOTION_ERRORS,
+    UNCERTAIN,
+    LeverArmScore,
+    information,
+)
 from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
@@ -375,13 +380,7 @@ class CalibrationFilter:
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
         """Step of the state by a score of all lever arms and the target's size, with the covariance S S'."""
-        information = np.zeros(self.layout.size)
-        for k, where in enumerate(self.layout.cameras.values()):
-            if where.position is not None:
-                information[where.position] = score[3 * k : 3 * k + 3]
-        if self.layout.target_scale is not None:
-            information[self.layout.target_scale] = score[-1] / self.state.target_scale
-        return np.asarray(S @ (S.T @ information))
+        return np.asarray(S @ (S.T @ information(score, self.state, self.layout)))
 
     def finite(self) -> bool:
         """Whether state and covariance are finite."""

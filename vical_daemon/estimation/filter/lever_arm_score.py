@@ -10,7 +10,7 @@ and solves sum (dr/dp)' S^-1 r = 0. At the true p, however,
 
 because S(p) is the covariance of r(p). Each image adds this to the information vector, and P times the sum is
 the bias. The sum does not depend on how fast the rig moves; P does. Likewise the size of the target shows in
-moves of the camera, which accelerations predict with noise.
+moves of the camera, which accelerations predict with noise. Likewise the accelerometer's scale.
 [docs/math/filter.md, "Lever arms and noise of the gyro"]
 """
 
@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dgesv
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.state import ATTITUDE, BIASES, MOTION
+from vical_daemon.estimation.model.state import ATTITUDE, BIASES, LOWER, MOTION, Layout, State
 from vical_daemon.estimation.model.unscented import unit
 
 MOTION_ERRORS = BIASES.stop
@@ -31,6 +31,7 @@ MOTION_ERRORS = BIASES.stop
 UNCERTAIN = 0.5
 """Share of the bias: it goes with the square of the gyro's noise, which a data sheet gives to a quarter."""
 _BIASES = np.arange(BIASES.start, BIASES.stop)
+_DIAGONAL = np.flatnonzero(LOWER[:, 0] == LOWER[:, 1])  # of the accelerometer matrix, among its entries
 _BY_ARM = -so3.hat(so3.IDENTITY)
 """Derivative of -hat(p) by each component of p, shape (3, 3, 3)."""
 
@@ -102,3 +103,29 @@ class LeverArmScore:
         new[1:] = J @ dP @ J.T - 2.0 * (G @ dT @ new[0])
         self.P = 0.5 * (new + np.swapaxes(new, 1, 2))
         return np.asarray(score)
+
+
+def information(score: FloatArray, state: State, layout: Layout) -> FloatArray:
+    """Information vector of a score, shape (layout.size,).
+
+    If target, lever arms, gravity and the accelerometer's matrix grow by one factor, no innovation changes,
+    and no S either. Gravity has no noise. So the score by the logarithm of the matrix is minus that of the
+    size and all arms together; each axis gets a third, as if all were equally noisy. Without this part every
+    image would move all of these by one factor, which only the prior of gravity limits.
+
+    Args:
+        score: By all lever arms, 1/m, and the logarithm of the target's size, shape (3 cameras + 1,).
+        state: Nominal state.
+        layout: Where the errors live.
+    """
+    out = np.zeros(layout.size)
+    for k, where in enumerate(layout.cameras.values()):
+        if where.position is not None:
+            out[where.position] = score[3 * k : 3 * k + 3]
+    if layout.target_scale is not None:
+        out[layout.target_scale] = score[-1] / state.target_scale
+    if layout.accel_matrix is not None:
+        arms_m = np.concatenate([state.cameras[name].p_imu_cam for name in layout.cameras])
+        by_matrix = -(score[-1] + arms_m @ score[:-1]) / 3.0
+        out[layout.accel_matrix.start + _DIAGONAL] = by_matrix / np.diag(state.accel_matrix)
+    return out

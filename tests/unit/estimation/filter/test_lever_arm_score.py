@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, LeverArmScore
+from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, LeverArmScore, information
+from vical_daemon.estimation.model.retract import difference
+from vical_daemon.estimation.model.state import CameraState, State, make_layout
 
 STEPS = 6
 
@@ -59,3 +61,31 @@ def test_score_is_half_the_derivative_of_log_det(seed):
         moved = step * np.eye(6)[i].reshape(2, 3)
         slope = (log_det_s(seed, arms + moved) - log_det_s(seed, arms - moved)) / (2.0 * step)
         assert score[i] == pytest.approx(0.5 * slope, abs=0.02 * np.abs(score[:6]).max())
+
+
+def scaled(factor):
+    """A rig, with all lengths and forces times a factor."""
+    rng = np.random.default_rng(5)
+    cameras = {
+        name: CameraState(
+            np.eye(3), factor * rng.normal(size=3), 0.0, 500.0 * np.ones(4), np.zeros(4), "radtan", (640, 480)
+        )
+        for name in ("cam0", "cam1")
+    }
+    p, v, gravity = factor * rng.normal(size=(3, 3))
+    matrix = factor * (np.eye(3) + np.tril(0.1 * rng.normal(size=(3, 3))))
+    biases = rng.normal(size=(2, 3))
+    return State(
+        0.0, np.eye(3), p, v, *biases, gravity, cameras, np.eye(3), matrix, target_scale=1.1 * factor
+    )
+
+
+def test_no_image_shows_a_factor_common_to_target_rig_gravity_and_accelerometer():
+    estimate = frozenset({"imu_intrinsics", "target_scale"})
+    layout = make_layout({"cam0": "radtan", "cam1": "radtan"}, fix=frozenset(), estimate=estimate)
+    step = 1e-4
+    grown = difference(scaled(1.0 + step), scaled(1.0), layout) / step
+    score = np.array([1.9, -0.3, 0.2, 2.1, 0.1, -0.4, -0.8])
+    out = information(score, scaled(1.0), layout)
+    assert np.abs(out * grown).max() > 0.1
+    assert out @ grown == pytest.approx(0.0, abs=1e-9)
