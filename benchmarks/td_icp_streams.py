@@ -21,7 +21,6 @@ from vical_daemon.estimation.temporal.td_icp_input import OrientationStream, TdI
 from vical_daemon.estimation.temporal.td_icp_result import TdIcpResult
 
 FloatArray = npt.NDArray[np.float64]
-_LENS_VIEWS = 60
 
 
 def _handheld(seed: int, seconds: float) -> tuple[TdIcpResult, float, FloatArray]:
@@ -32,7 +31,7 @@ def _handheld(seed: int, seconds: float) -> tuple[TdIcpResult, float, FloatArray
     used = starting_camera(
         CameraPrior(lens.resolution, tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
     )
-    estimate_intrinsics(used, frames, board_points(), _LENS_VIEWS)
+    estimate_intrinsics(used, frames, board_points())
     poses = target_orientations(frames, board_points(), used.intrinsics, used.distortion, lens.model)
     base = int(run.t_imu_ns[0])
     result = td_icp(
@@ -110,7 +109,7 @@ def study_real(folder: Path) -> None:
     points = load_target(folder / "target.yaml").points_m
     frames = [f for f in recording.points_frames("cam0") if len(f.ids)]
     lens = starting_camera(camera)
-    estimate_intrinsics(lens, frames, points, _LENS_VIEWS)
+    estimate_intrinsics(lens, frames, points)
     poses = target_orientations(frames, points, lens.intrinsics, lens.distortion, lens.distortion_model)
     imu = recording.imu_arrays("imu0")
     base = int(imu.t_ns[0])

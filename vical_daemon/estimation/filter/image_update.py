@@ -13,11 +13,10 @@ from scipy.linalg import lstsq
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray
 from vical_daemon.estimation.model import unscented
-from vical_daemon.estimation.noise.corner_noise import MOST_PX, noise_of_image
+from vical_daemon.estimation.noise.corner_noise import MOST_PX, POSE_DOF, noise_of_image
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
-POSE_DOF = 6  # degrees of freedom of an image that its pose takes up
 _ITERATIONS = 5  # of the update, at most: each takes a digit or more off what is left
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
 _CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)  # of a corner before the update

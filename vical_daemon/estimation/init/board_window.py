@@ -8,7 +8,6 @@ until nothing changes, so the lever arm and mounting of the closed form no longe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,7 +17,6 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.image_update import POSE_DOF
 from vical_daemon.estimation.filter.linearise import (
     Image,
     by_small_steps,
@@ -46,9 +44,16 @@ from vical_daemon.estimation.model.priors import AGAIN_SIGMAS, SHIFT_SIGMA_S
 from vical_daemon.estimation.model.rates import Rates, rates_at
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import BIASES, GRAVITY, MOTION, State
-from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
+from vical_daemon.estimation.noise.corner_noise import (
+    LEAST_PX,
+    MOST_PX,
+    POSE_DOF,
+    median_noise,
+    noise_of_image,
+    relative_noise,
+)
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, MOST_STEPS, geman_mcclure_weight, median
+from vical_daemon.estimation.robust import MOST_STEPS, geman_mcclure_weight
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
@@ -447,18 +452,12 @@ class BoardWindow:
         for name in self.sigma_px:
             own = [size for v, size in zip(views, lengths, strict=True) if v.camera == name]
             if own:
-                sigma = _level(np.concatenate(own), len(own))
+                sigma = median_noise(np.concatenate(own), len(own))
                 self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
         self.noise = []
         for view, size in zip(views, lengths, strict=True):
-            dof, ratio = max(2 * len(size) - POSE_DOF, 0), _level(size) / self.sigma_px[view.camera]
+            dof, ratio = max(2 * len(size) - POSE_DOF, 0), median_noise(size) / self.sigma_px[view.camera]
             self.noise.append(noise_of_image(dof * ratio * ratio, dof))
-
-
-def _level(size: FloatArray, images: int = 1) -> float:
-    """Corner noise per axis by the median length of residuals, as far as poses have not taken them up."""
-    share = max(1.0 - POSE_DOF * images / (2.0 * len(size)), 0.05)
-    return median(size) / MEDIAN_RAYLEIGH / math.sqrt(share)
 
 
 def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:

@@ -1,6 +1,5 @@
-"""Rough intrinsics from the first views of a planar target: Zhang's closed form, then a small bundle.
+"""A lens adjusted to views of a planar target, with a pose each: for the start of the filter, and for TD-ICP.
 
-Only a start: the filter estimates the same eight numbers with everything else.
 [Zhang, "A flexible new technique for camera calibration", 2000, section 3]
 """
 
@@ -17,33 +16,63 @@ from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, inliers, pl
 from vical_daemon.estimation.init.target_poses import ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.noise.corner_noise import median_noise
 from vical_daemon.estimation.robust import MOST_STEPS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS
 
-MOST_VIEWS = 24  # spread over places, sizes and slants; the filter refines the lens
+_MOST_VIEWS = 24  # spread over places, sizes and slants; the filter refines the lens
+_EVEN_VIEWS = 60  # of a recording: the board is then seen in many places; takes half a second
 _FEWEST = 6  # views
 _Poses = list[tuple[FloatArray, FloatArray]]
 # relative to fx for the first four; four for the distortion, and radtan's fifth
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
 
 
-def estimate_intrinsics(
-    lens: CameraState, frames: list[PointsFrame], target: FloatArray, most: int = MOST_VIEWS
-) -> LensFit | None:
-    """Improve a lens in place by a bundle adjustment over spread-out views (Gauss-Newton, Levenberg damping).
+def estimate_intrinsics(lens: CameraState, frames: list[PointsFrame], target: FloatArray) -> LensFit | None:
+    """Improve a lens in place by views that are spread evenly over a recording.
+
+    They are like the views whose poses the lens is for. No lens model fits exactly, so a lens adjusted to
+    those that differ most would be that of the edge of the image. For the same reason all views have one
+    noise: corners beyond it, which a blurred image or the edge of the lens displaces, are left out.
 
     Args:
         lens: Start values; overwritten.
         frames: Views of the target.
         target: Its points, m, shape (n, 3).
-        most: Views used.
 
     Returns:
         The fit; None when too few views show a pose (the lens is then left alone).
     """
-    fit = fit_lens([frames[k] for k in spread(frames, lens, most)], lens, target)
+    views = [f for f in frames if len(f.ids) >= MIN_POINTS]
+    views = views[:: max(1, -(-len(views) // _EVEN_VIEWS))]
+    fit = fit_lens(views, lens, target)
+    for _ in range(MOST_STEPS):
+        if fit is None:
+            return None
+        views = _of_one_noise(fit, lens.distortion_model, target)
+        if sum(len(v.ids) for v in views) == sum(len(v.ids) for v in fit.views):
+            break
+        fit = fit_lens(views, lens, target)
     if fit is not None:
         fit.take_into(lens)
     return fit
+
+
+def _of_one_noise(fit: LensFit, model: str, target: FloatArray) -> list[PointsFrame]:
+    """The views with the corners within four sigma of the noise of all; those that keep half of them."""
+    far = [
+        np.linalg.norm(
+            v.uv_px - project(target[v.ids] @ R.T + p, fit.theta[:4], fit.theta[4:], model), axis=1
+        )
+        for v, (R, p) in zip(fit.views, fit.poses, strict=True)
+    ]
+    most = LIKELY_SIGMAS * median_noise(np.concatenate(far), len(far))
+    fine = [size <= most for size in far]
+    return [
+        view.only(good)
+        for view, good in zip(fit.views, fine, strict=True)
+        if 2 * good.sum() >= max(len(good), 2 * MIN_POINTS)
+    ]
 
 
 class LensFit(NamedTuple):
@@ -175,10 +204,10 @@ def _without_outliers(
     return view.only(good)
 
 
-def spread(frames: list[PointsFrame], lens: CameraState, most: int = MOST_VIEWS) -> list[int]:
+def spread(frames: list[PointsFrame], lens: CameraState) -> list[int]:
     """Choose views with many points that differ most in where the board lies in the image."""
     usable = [k for k, f in enumerate(frames) if len(f.ids) >= MIN_POINTS]
-    if len(usable) <= most:
+    if len(usable) <= _MOST_VIEWS:
         return usable
     good = [frames[k] for k in usable]
     width, height = lens.resolution
@@ -187,7 +216,7 @@ def spread(frames: list[PointsFrame], lens: CameraState, most: int = MOST_VIEWS)
     ) / np.array([width, height, width, height, width, height])
     chosen = [int(np.argmax([len(f.ids) for f in good]))]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)
-    while len(chosen) < most:
+    while len(chosen) < _MOST_VIEWS:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
     return sorted(usable[i] for i in chosen)

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, median
 from vical_daemon.estimation.significance import PERHAPS_SIGMAS
 
+POSE_DOF = 6  # degrees of freedom of an image that its pose takes up
 _GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
 LEAST_PX, MOST_PX = 0.005, 20.0  # of a corner's noise: a simulation without any, a detector that guesses
 _USUAL_DOF = 30.0
@@ -35,6 +37,17 @@ def noise_of_image(rest: float, dof: float) -> float:
         dof: Its degrees of freedom.
     """
     return math.sqrt((_USUAL_DOF + rest) / (_USUAL_DOF + dof))
+
+
+def median_noise(lengths: FloatArray, images: int = 1) -> float:
+    """Noise of corners per axis by the median length of residuals, as far as poses have not taken them up.
+
+    Args:
+        lengths: Of the residuals of all images, shape (n,).
+        images: How many.
+    """
+    share = max(1.0 - POSE_DOF * images / (2.0 * len(lengths)), 0.05)
+    return median(lengths) / MEDIAN_RAYLEIGH / math.sqrt(share)
 
 
 @dataclass(slots=True)

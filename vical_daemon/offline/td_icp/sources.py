@@ -24,7 +24,6 @@ from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore, s
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 GIVEN = "--initial"
-_LENS_VIEWS = 60  # where the board stands in the image is then seen in many places: half a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,7 @@ def board_poses(
         raise InputError(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
-    fit = estimate_intrinsics(lens, frames, points_m, _LENS_VIEWS)
+    fit = estimate_intrinsics(lens, frames, points_m)
     found = target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.distortion_model)
     if not len(found.t_cam_ns):
         count = sum(len(f.ids) > 0 for f in frames)

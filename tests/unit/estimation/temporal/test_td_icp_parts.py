@@ -63,7 +63,7 @@ def test_a_wrong_lens_is_put_right_by_the_views():
     wrong = truth * np.array([1.01, 1.01, 1.0, 1.0, 0.9, 0.9, 1.0, 1.0]) + np.array([0, 0, 5, -4, 0, 0, 0, 0])
     prior = CameraPrior(lens.resolution, tuple(wrong[:4]), lens.model, tuple(wrong[4:]))
     found = starting_camera(prior)
-    fit = estimate_intrinsics(found, frames, board_points(), 60)
+    fit = estimate_intrinsics(found, frames, board_points())
     assert len(fit.views) >= 15
     error = np.concatenate((found.intrinsics, found.distortion)) - truth
     sigma = np.array([1.8, 1.8, 0.75, 0.64, 2.2e-3, 5.0e-3, 3.0e-4, 3.6e-4])  # of these views at 0.2 px
