@@ -332,11 +332,18 @@ def test_images_that_hardly_show_the_pose_begin_no_motion_until_better_ones_come
     assert whole.motion(f, c._buffer).sigmas[0] == pytest.approx(0.03)
 
 
+@pytest.fixture(scope="module")
+def before_a_step():
+    c, events, shots = calibrator(run := simulate(141, BEGIN_S + 6.0)), [], []
+    follow(c, events, shots, [x for x in stream(run) if x[0] < COMMON_S])
+    return pickle.dumps((c, events, shots))
+
+
 @pytest.mark.parametrize("step_s", [2e-3, 5e-3])
-def test_a_step_of_milliseconds_is_a_step_and_no_bump(step_s):
+def test_a_step_of_milliseconds_is_a_step_and_no_bump(before_a_step, step_s):
     rig = reference_rig(141, bumps=(Bump(BEGIN_S, timeshift_s=step_s),))
     stepped = simulate(141, BEGIN_S + 6.0, rig=rig)
-    estimate, events, _ = calibrate(stepped)
+    estimate, events, _ = calibrate(stepped, so_far=before_a_step)
     found = [e for e in events if e.kind is EventKind.TIMESHIFT_STEPPED]
     assert not any(
         e.kind in (EventKind.BUMPED, EventKind.STARTED_OVER, EventKind.CLOCK_WANDER) for e in events
