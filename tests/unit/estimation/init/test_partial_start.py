@@ -1,6 +1,7 @@
 """Motion that shows only part of the calibration: that part is right, the rest named, nothing converges."""
 
 from copy import deepcopy
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,20 +23,31 @@ def run_of(motion, seed=4, seconds=20.0, rate_hz=10.0):
     return simulate(seed, seconds, rig=rig, camera_rate_hz=rate_hz)
 
 
-@pytest.mark.parametrize(
-    ("motion", "hidden_cam"),
-    [
-        (trajectory.pure_translation(4, T_imu_cam=MOUNT), np.eye(3)),
-        (trajectory.one_axis(4, [0, 0, 1], T_imu_cam=MOUNT), np.eye(3)[2:]),
-        (trajectory.one_axis(4, [1, 0, 0], T_imu_cam=MOUNT), np.eye(3)[:1]),
-    ],
-    ids=["pure translation", "about the optical axis", "nodding"],
-)
-def test_what_the_motion_shows_is_right_and_what_it_does_not_is_named(motion, hidden_cam):
-    run = run_of(motion)
-    statuses = []
-    c = calibrate(run, each=lambda c: statuses.append(c.estimate().status))
-    estimate = c.estimate()
+MOTIONS = {
+    "pure translation": (trajectory.pure_translation(4, T_imu_cam=MOUNT), np.eye(3)),
+    "about the optical axis": (trajectory.one_axis(4, [0, 0, 1], T_imu_cam=MOUNT), np.eye(3)[2:]),
+    "nodding": (trajectory.one_axis(4, [1, 0, 0], T_imu_cam=MOUNT), np.eye(3)[:1]),
+}
+
+
+@cache
+def followed(name):
+    """A recording, its estimate, the statuses on the way, and the filter after ten seconds."""
+    run = run_of(MOTIONS[name][0])
+    statuses, after_10_s = [], []
+
+    def each(c):
+        statuses.append(c.estimate().status)
+        if len(statuses) == 50:
+            after_10_s.append(deepcopy(c.filter))
+
+    return run, calibrate(run, each=each).estimate(), statuses, after_10_s[0]
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_what_the_motion_shows_is_right_and_what_it_does_not_is_named(name):
+    run, estimate, statuses, _ = followed(name)
+    hidden_cam = MOTIONS[name][1]
     assert Status.CONVERGED not in statuses
     assert estimate.status == Status.DEGENERATE
     x, sigma = errors(estimate, run)
@@ -150,15 +162,9 @@ def test_a_rig_that_has_turned_at_one_rate_is_known_as_soon_as_it_turns_otherwis
     assert sigma[:3].max() < 3e-3
 
 
-@pytest.fixture(scope="module")
-def translated():
-    """The filter after ten seconds without any turn."""
-    return calibrate(run_of(trajectory.pure_translation(4, T_imu_cam=MOUNT), seconds=10.0)).filter
-
-
 @pytest.mark.parametrize(("turn_rad", "ends"), [(0.03, False), (0.2, True)])
-def test_an_axis_that_begins_to_turn_ends_a_filter_that_holds_it(translated, turn_rad, ends):
-    f = deepcopy(translated)
+def test_an_axis_that_begins_to_turn_ends_a_filter_that_holds_it(turn_rad, ends):
+    f = deepcopy(followed("pure translation")[-1])
     assert len(f.unobservable.axes) == 3
     still, ended = f.state.R_world_imu, []
     for share in np.linspace(0.0, 1.0, 20):  # of a second
