@@ -35,16 +35,15 @@ def copy(short: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(short, tmp_path / "copy"))
 
 
+@pytest.fixture
+def copy_of_5_s(shortest: Path, tmp_path: Path) -> Path:
+    """The same of the shortest recording: enough where one attempt to start is."""
+    return Path(shutil.copytree(shortest, tmp_path / "copy"))
+
+
 def _arguments(folder: Path, *more: str) -> list[str]:
     target, initial = str(folder / "target.yaml"), str(folder / "initial.yaml")
     return ["calibrate", str(folder), "--target", target, "--initial", initial, "--fix", "intrinsics", *more]
-
-
-def _calibrate(folder: Path, capsys: pytest.CaptureFixture[str]) -> dict:
-    code = main(_arguments(folder, "--json", "--accept", "converging"))
-    out = capsys.readouterr().out
-    assert code == 0
-    return json.loads(out)
 
 
 @pytest.fixture(scope="session")
@@ -291,9 +290,10 @@ def test_a_camera_too_slow_for_a_start_is_told_how_many_images_that_needs(tmp_pa
 
 
 def test_a_failure_is_one_line_and_keeps_an_earlier_result(
-    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    copy_of_5_s: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     """A board 23 times too large, as if no other size were tried: the accelerometer shows it."""
+    copy = copy_of_5_s
     monkeypatch.setattr("vical_daemon.estimation.init.velocity_gravity_init._other_size", lambda *_: None)
     earlier = copy / "result.json"
     earlier.write_text("of yesterday", encoding="utf-8")
@@ -305,20 +305,22 @@ def test_a_failure_is_one_line_and_keeps_an_earlier_result(
     assert earlier.read_text(encoding="utf-8") == "of yesterday"
 
 
-def test_the_gravity_of_the_place_is_used(copy: Path, capsys) -> None:
-    assert main(_arguments(copy, "--gravity", "9.78", "--json", "--accept", "converging")) == 0
+def test_the_gravity_of_the_place_is_used(shortest: Path, capsys) -> None:
+    assert main(_arguments(shortest, "--gravity", "9.78", "--json", "--accept", "converging")) == 0
     result = json.loads(capsys.readouterr().out)
     assert np.linalg.norm(result["gravity_world_mps2"]) == pytest.approx(9.78)
 
 
-def test_a_slipped_decimal_point_is_reported_and_the_answer_is_right(copy: Path, capsys) -> None:
-    plain = _calibrate(copy, capsys)["cameras"]["cam0"]["T_imu_cam"]
-    assert main([*_with_tag_size(copy, 0.88), "--json", "--accept", "converging"]) == 0
+def test_a_slipped_decimal_point_is_reported_and_the_answer_is_right(
+    copy_of_5_s: Path, plain: str, capsys
+) -> None:
+    known = json.loads(plain)["cameras"]["cam0"]["T_imu_cam"]
+    assert main([*_with_tag_size(copy_of_5_s, 0.88), "--json", "--accept", "converging"]) == 0
     result = json.loads(capsys.readouterr().out)
     (size,) = (e for e in result["events"] if e["kind"] == "target_size")
     assert size["value"] == pytest.approx(-0.9, abs=0.02)
-    apart_m = np.subtract(result["cameras"]["cam0"]["T_imu_cam"]["p_m"], plain["p_m"])
-    sigma_m = np.sqrt(np.diag(np.reshape(plain["covariance"], (6, 6)))[:3])
+    apart_m = np.subtract(result["cameras"]["cam0"]["T_imu_cam"]["p_m"], known["p_m"])
+    sigma_m = np.sqrt(np.diag(np.reshape(known["covariance"], (6, 6)))[:3])
     assert np.all(np.abs(apart_m) < 1.0 * sigma_m)
 
 
