@@ -18,13 +18,11 @@ from vical_mocks.points import simulate
 
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
 from vical_daemon.cli import calibration_text, main
-from vical_daemon.config.priors import read_initial
 from vical_daemon.estimation.result import Status
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.channel import stamp_of
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.offline import calibrate
-from vical_daemon.offline.calibration_job import make_job
 
 G = 9.80665
 
@@ -47,12 +45,28 @@ def _arguments(folder: Path, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def plain(shortest: Path) -> str:
-    """What the command prints for the shortest recording."""
-    out = io.StringIO()
-    with redirect_stdout(out):
+def calibrated(shortest: Path) -> tuple[str, calibrate.Outcome]:
+    """What the command prints for the shortest recording, and what it has found."""
+    out, found, run_job = io.StringIO(), list[calibrate.Outcome](), calibrate.run_job
+
+    def run(*words, **options) -> calibrate.Outcome:
+        found.append(run_job(*words, **options))
+        return found[-1]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
+        patch.setattr(calibrate, "run_job", run)
         assert main(_arguments(shortest, "--json", "--accept", "converging")) == 0
-    return out.getvalue()
+    return out.getvalue(), found[0]
+
+
+@pytest.fixture(scope="session")
+def plain(calibrated) -> str:
+    return calibrated[0]
+
+
+@pytest.fixture(scope="session")
+def outcome(calibrated) -> calibrate.Outcome:
+    return calibrated[1]
 
 
 def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
@@ -100,17 +114,6 @@ def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(
     assert main(["calibrate", str(log), *more]) == 0
     told_s = json.loads(capsys.readouterr().out)["cameras"]["cam0"]["timeshift_sigma_s"]
     assert plain_s < 4e-4 < 5e-4 <= told_s
-
-
-@pytest.fixture(scope="session")
-def outcome(shortest: Path) -> calibrate.Outcome:
-    job = make_job(
-        open_recording(shortest),
-        read_initial(shortest / "initial.yaml"),
-        target=str(shortest / "target.yaml"),
-        fix=("intrinsics",),
-    )
-    return calibrate.run_job(job, lambda share, estimate: None)
 
 
 @pytest.mark.parametrize(
