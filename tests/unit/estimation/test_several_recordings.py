@@ -264,14 +264,15 @@ def test_without_a_target_too() -> None:
     # the tracks of a room: the world's z is up, and stays so
     rig = another(1001, gravity_world_mps2=nominal_gravity())
     second = simulate_tracks(1001, 14.0, rig=rig, camera_rate_hz=10.0)
+    calibrators = [calibrator(first, TargetFreeCalibrator, target_free=True) for _ in range(2)]
+    for c, run in zip(calibrators, (first, second), strict=True):
+        feed(c, items(run))
+    both = pickle.loads(pickle.dumps(calibrators[0]))
+    assert both.can_go_on
+    both.next_recording()
+    feed(both, items(second, later_s=14.0 + APART_S))
     sigmas = []
-    for runs in ((first,), (second,), (first, second)):
-        c = calibrator(first, TargetFreeCalibrator, target_free=True)
-        for k, run in enumerate(runs):
-            if k:
-                assert c.can_go_on
-                c.next_recording()
-            feed(c, items(run, later_s=k * (14.0 + APART_S)))
+    for c in (*calibrators, both):
         error, covariance = error_and_covariance(c.estimate(), first)
         assert nees(error, covariance, 7) < chi2.isf(1e-3, 7)
         sigmas.append(np.sqrt(np.diag(covariance)))
