@@ -1,5 +1,7 @@
 """mounting_search.py: mountings found in the tracks of a flat scene."""
 
+from functools import cached_property
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -29,6 +31,23 @@ class Wall:
         ]
         self.lens = (np.array(rig.lens.intrinsics), np.array(rig.lens.distortion), rig.lens.model)
 
+    @cached_property
+    def found(self):
+        """Likely mountings with nothing known."""
+        return likely_mountings(self.t, self.gyro, self.frames, self.lens, np.linspace(-0.2, 0.2, 5))
+
+    @cached_property
+    def best(self):
+        """The best of the fits from all of them."""
+        return self.best_fit()
+
+    def fit(self, *seed, **how):
+        return epipolar_fit(self.t, self.gyro, self.frames, self.lens, *seed, **how)
+
+    def best_fit(self, **how):
+        fits = [self.fit(*seed, **how) for seed in self.found]
+        return min((f for f in fits if f), key=lambda f: f.error / f.inliers)
+
     def off_deg(self, R):
         return float(np.rad2deg(np.linalg.norm(so3.log(self.rig.R_imu_cam.T @ R))))
 
@@ -39,27 +58,15 @@ def wall(request):
 
 
 def test_the_mounting_is_among_the_likely_ones_with_nothing_known(wall):
-    found = likely_mountings(wall.t, wall.gyro, wall.frames, wall.lens, np.linspace(-0.2, 0.2, 5))
-    assert min(wall.off_deg(R) for R, _ in found[:2]) < 27.0
-    fits = [epipolar_fit(wall.t, wall.gyro, wall.frames, wall.lens, *seed) for seed in found]
-    best = min((f for f in fits if f), key=lambda f: f.error / f.inliers)
-    assert wall.off_deg(best.R_imu_cam) < 8.0
-    assert abs(best.timeshift_s) < 5e-3
+    assert min(wall.off_deg(R) for R, _ in wall.found[:2]) < 27.0
+    assert wall.off_deg(wall.best.R_imu_cam) < 8.0
+    assert abs(wall.best.timeshift_s) < 5e-3
 
 
 def test_looking_around_roughly_finds_the_same_place(wall):
     """Fits that are only compared took all their steps, up to 70 % of the CPU time of an attempt."""
-    found = likely_mountings(wall.t, wall.gyro, wall.frames, wall.lens, np.linspace(-0.2, 0.2, 5))
-
-    def fitted(*seed, **how):
-        return epipolar_fit(wall.t, wall.gyro, wall.frames, wall.lens, *seed, **how)
-
-    def from_the_best(**how):
-        fits = [fitted(*seed, **how) for seed in found]
-        best = min((f for f in fits if f), key=lambda f: f.error / f.inliers)
-        return fitted(best.R_imu_cam, best.timeshift_s)
-
-    here, there = from_the_best(roughly=True), from_the_best()
+    rough = wall.best_fit(roughly=True)
+    here, there = (wall.fit(best.R_imu_cam, best.timeshift_s) for best in (rough, wall.best))
     assert np.rad2deg(np.linalg.norm(so3.log(here.R_imu_cam.T @ there.R_imu_cam))) < 0.4
     assert abs(here.timeshift_s - there.timeshift_s) < 4e-4
     assert here.error / here.inliers < 1.01 * there.error / there.inliers
