@@ -53,7 +53,10 @@ def read_file(path: Path, limit: int) -> bytes:
         OSError: As `open_file`.
     """
     with open_file(path, limit) as file:
-        data = file.read(limit + 1)  # the size that a file states may be wrong: /proc, a file that grows
+        try:
+            data = file.read(limit + 1)  # the size that a file states may be wrong: /proc, a file that grows
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
     if len(data) > limit:
         raise _too_large(path, limit)
     return data

@@ -118,6 +118,7 @@ def help_text(commands: dict[str, table.Command]) -> str:
 def _dispatch(words: list[str]) -> int:
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
+    _refuse_empty(words)
     selected = _selected(words)
     parser, commands = build_parser(selected)
     if selected is not None and selected not in commands:
@@ -145,6 +146,17 @@ def _dispatch(words: list[str]) -> int:
     _set_up_logging(args)
     options.check_outputs(args)
     return int(import_module(commands[args._command].module).run(args))
+
+
+def _refuse_empty(words: list[str]) -> None:
+    """Refuse empty words (a variable of the shell is not set): an empty --target would mean no board."""
+    for i, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if word and not (option.startswith("--") and equals and not value):
+            continue
+        before = words[i - 1] if i and words[i - 1].startswith("-") else ""
+        name = option or before or f"argument {i}"
+        raise errors.CliError(f"{name} is empty; is the shell's variable set?", errors.EXIT_USAGE)
 
 
 def _nearest_option(parser: argparse.ArgumentParser, selected: str | None, word: str) -> str:

@@ -125,7 +125,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     for path in filter(None, (args.report, args.output)):
         _check_output(path)
-    files = [Path(path).resolve() for path in args.inputs]
+    files = [os.path.realpath(path) for path in args.inputs]
     for i, file in enumerate(files):
         if file in files[:i]:
             raise CliError(f"{args.inputs[i]} is given twice; its data count only once", EXIT_USAGE)

@@ -60,7 +60,7 @@ def _check(args: argparse.Namespace) -> None:
         value = getattr(args, name)
         if value is not None and value <= 0:
             raise CliError(f"--{name} must be positive", 2)
-    if args.plot and not Path(args.plot).resolve().parent.is_dir():
+    if args.plot and not Path(args.plot).absolute().parent.is_dir():
         raise CliError(f"{args.plot}: no such folder", 2)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import shutil
 import sys
 import textwrap
@@ -202,7 +203,7 @@ def check_outputs(args: argparse.Namespace) -> None:
         for name in (item for item in read if isinstance(item, str | Path)):
             if path.is_file() and Path(name).exists() and path.samefile(name):
                 raise CliError(f"{path} is read by this command, and would be replaced", EXIT_USAGE)
-    places = [path.resolve() for path in written if path.is_file() or not path.exists()]
+    places = [os.path.realpath(path) for path in written if path.is_file() or not path.exists()]
     for place in places:
         if places.count(place) > 1:
             raise CliError(f"{place}: two outputs cannot be written to one file", EXIT_USAGE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +150,7 @@ def _must_write(args: argparse.Namespace, yaml_path: Path, target: Target) -> bo
 
     if not yaml_path.exists():
         return True
-    if args.source is not None and yaml_path.resolve() == args.source.resolve():
+    if args.source is not None and os.path.realpath(yaml_path) == os.path.realpath(args.source):
         return False
     with suppress(TargetError):
         if load_target(yaml_path) == target:

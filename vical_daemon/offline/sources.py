@@ -84,7 +84,8 @@ def _from_log(path: Path) -> Rig:
         for message in _messages(path):
             found.take(message)
     except (MessageError, RecordingError, LogError) as error:
-        raise InputError(f"{path}: {error}") from None
+        line = str(error)
+        raise InputError(line if line.startswith(str(path)) else f"{path}: {line}") from None
     return found.rig(path)
 
 

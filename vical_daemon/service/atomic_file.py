@@ -70,7 +70,7 @@ def write_output(path: Path, data: str | bytes) -> None:
         OSError: It cannot be written, or its folder is missing; names the file.
     """
     content = data.encode(errors="replace") if isinstance(data, str) else data
-    place = path.resolve()
+    place = Path(os.path.realpath(path))
     try:
         before = path.stat()
     except FileNotFoundError:

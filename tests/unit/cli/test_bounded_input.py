@@ -111,6 +111,8 @@ def make(kind: str, path: Path) -> None:
     elif kind == "huge":
         with path.open("wb") as file:
             file.truncate(2**40)  # sparse
+    elif kind == "loop":
+        path.symlink_to(path.name)
     else:
         path.symlink_to("/dev/zero")
 
@@ -128,7 +130,7 @@ def sound(tmp_path: Path) -> Path:
     return tmp_path / "sound"
 
 
-KINDS = ["device", "pipe", "socket", "folder", "huge"]
+KINDS = ["device", "pipe", "socket", "folder", "huge", "loop"]
 
 
 def test_what_is_no_file_is_refused_in_one_line(tmp_path: Path, sound: Path) -> None:

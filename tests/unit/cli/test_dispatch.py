@@ -158,6 +158,9 @@ def test_bad_option_is_one_line_with_the_help_to_read(command, capsys) -> None:
     [
         (["x"], "probe: unexpected argument 'x' (see `vical probe --help`)"),
         (["--targt", "x"], "probe: unexpected argument '--targt'; did you mean --target?"),
+        (["--target", ""], "--target is empty; is the shell's variable set?"),
+        (["--target="], "--target is empty; is the shell's variable set?"),
+        ([""], "argument 1 is empty; is the shell's variable set?"),
     ],
 )
 def test_an_argument_too_many_is_named_with_the_help_of_its_command(command, capsys, words, line) -> None:

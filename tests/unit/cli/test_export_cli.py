@@ -160,6 +160,13 @@ def test_wrong_sources_are_one_line(tmp_path, capsys, content, says):
     assert len(error.splitlines()) == 1
 
 
+def test_a_file_is_named_once(tmp_path, capsys):
+    log = tmp_path / "log.mcap"
+    log.touch()
+    assert main(["export", str(log), "--format", "kalibr"]) == 1
+    assert capsys.readouterr().err == f"vical: error: {log} is empty; was it copied in full?\n"
+
+
 def test_missing_source_and_bad_usage(capsys, result_file):
     assert main(["export", "no_such_file", "--format", "json"]) == 1
     assert main(["export", str(result_file), "--format", "ros", "--camera", "nobody"]) == 2

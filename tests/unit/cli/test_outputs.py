@@ -55,6 +55,13 @@ def test_an_output_onto_an_input_is_bad_usage(words, files, capsys) -> None:
     assert all(path.read_text() == TARGET for path in files.values())
 
 
+def test_an_output_onto_a_link_to_itself_is_one_line(files, capsys) -> None:
+    Path("loop").symlink_to("loop")
+    assert main(["target", "--type", "checkerboard", "-o", "loop.svg", "--yaml", "loop"]) == 1
+    err = capsys.readouterr().err
+    assert err == "vical: error: loop: cannot be written (Too many levels of symbolic links)\n"
+
+
 def test_a_full_disk_does_not_cost_the_result(tmp_path, monkeypatch, capsys) -> None:
     """It is printed although the file cannot be written."""
 

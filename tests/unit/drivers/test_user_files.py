@@ -41,6 +41,12 @@ def test_a_file_that_states_no_size_is_read_to_the_limit() -> None:
         read_file(path, 100)
 
 
+def test_what_a_disk_refuses_while_it_is_read_names_the_file() -> None:
+    with pytest.raises(OSError, match="Input/output error") as caught:
+        read_file(Path("/proc/self/mem"), 100)
+    assert caught.value.filename == "/proc/self/mem"
+
+
 @pytest.mark.parametrize("kind", ["folder", "pipe", "socket", "device"])
 def test_what_is_no_file_is_named_and_refused(kind: str, tmp_path: Path) -> None:
     path = tmp_path / kind

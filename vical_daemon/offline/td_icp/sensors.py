@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -66,10 +67,10 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
 
 def _each_once(request: TdIcpRequest, names: list[str]) -> list[str]:
     """The names without those that were given before; INPUT is the first sensor where it is a trajectory."""
-    known = {request.path.resolve()} if is_trajectory(request.path) else set()
+    known = {os.path.realpath(request.path)} if is_trajectory(request.path) else set()
     kept = []
     for name in names:
-        place = Path(name).resolve()
+        place = os.path.realpath(name)
         if place in known:
             request.warn(f"--sensors: {name} is given twice, and taken once")
         else:

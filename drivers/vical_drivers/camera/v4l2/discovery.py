@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -110,9 +111,9 @@ def find_node(kernel: Kernel, name: str) -> NodeEntry:
                 return entry
         known = ", ".join(e.stable_path or e.path for e in nodes) or "none"
         raise DeviceNotFoundError(f"v4l2:{name}: no camera with that serial number; there are: {known}")
-    real = Path(name).resolve()
+    real = Path(os.path.realpath(name))  # `resolve` raises RuntimeError for a link to itself
     for entry in nodes:
-        if Path(entry.path).resolve() == real:
+        if Path(os.path.realpath(entry.path)) == real:
             return entry
     # a node without sysfs entry (a container): use it as it is
     return NodeEntry(path=name, name="", index=0, serial_number="", port=real.name)
