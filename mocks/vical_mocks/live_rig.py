@@ -112,7 +112,7 @@ class LiveRig:
                 process = context.Process(
                     target=_DEVICES[device], args=(self.settings, self.t_start_s, there), daemon=True
                 )
-                process.start()
+                _start_deaf_to_interrupts(process)
                 there.close()
                 self._processes.append(process)
                 self._pipes[device] = here
@@ -207,9 +207,17 @@ class LiveCamera(Closing):
         """The pipe belongs to the rig."""
 
 
+def _start_deaf_to_interrupts(process: multiprocessing.process.BaseProcess) -> None:
+    """Start a process that no ^C reaches, not even while it loads its libraries: it ends with its pipe."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> None:
     """Emulate the IMU until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the parent: when it ends, the pipe closes
     from vical_mocks.gx3_emulator import Gx3Emulator
     from vical_mocks.imu import GX3_25_ERRORS, FloatArray, ImuErrors
 
@@ -236,7 +244,6 @@ def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> N
 
 def _run_camera(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> None:
     """Render until the pipe closes; pictures are drawn ahead of time where the processor allows."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     import cv2
 
     from vical_mocks.camera import CameraSettings, SimulatedCamera
