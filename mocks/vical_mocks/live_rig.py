@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from types import SimpleNamespace, TracebackType
 from typing import Any, Self
@@ -209,6 +210,7 @@ class LiveCamera(Closing):
 
 def _start_deaf_to_interrupts(process: multiprocessing.process.BaseProcess) -> None:
     """Start a process that no ^C reaches, not even while it loads its libraries: it ends with its pipe."""
+    resource_tracker.ensure_running()  # else `start` does it, and unblocks the signal again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
     try:
         process.start()
