@@ -53,6 +53,8 @@ def describe_known(error: BaseException) -> tuple[str, int] | None:
     """
     if type(error).__module__.split(".")[0] in _OURS:
         return _one_line(str(error)), int(getattr(error, "exit_code", EXIT_FAILURE))
+    if isinstance(error, FileNotFoundError) and error.filename is None:  # `os.getcwd`
+        return "the current folder has been removed; change to another one", EXIT_FAILURE
     if isinstance(error, OSError) and error.filename is None and error.errno in _REFUSALS:
         return error.strerror or str(error), EXIT_FAILURE
     if isinstance(error, OSError) and error.filename is not None:

@@ -62,6 +62,17 @@ def test_an_output_onto_a_link_to_itself_is_one_line(files, capsys) -> None:
     assert err == "vical: error: loop: cannot be written (Too many levels of symbolic links)\n"
 
 
+def test_a_current_folder_that_was_removed_is_no_bug(tmp_path, monkeypatch, capsys) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(["target", "--type", "checkerboard", "-o", "board.pdf"]) == 1
+    assert capsys.readouterr().err == (
+        "vical: error: the current folder has been removed; change to another one\n"
+    )
+
+
 def test_a_full_disk_does_not_cost_the_result(tmp_path, monkeypatch, capsys) -> None:
     """It is printed although the file cannot be written."""
 
