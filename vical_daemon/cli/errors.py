@@ -53,7 +53,7 @@ def describe_known(error: BaseException) -> tuple[str, int] | None:
     """
     if type(error).__module__.split(".")[0] in _OURS:
         return _one_line(str(error)), int(getattr(error, "exit_code", EXIT_FAILURE))
-    if isinstance(error, FileNotFoundError) and error.filename is None:  # `os.getcwd`
+    if isinstance(error, FileNotFoundError) and _folder_is_gone():
         return "the current folder has been removed; change to another one", EXIT_FAILURE
     if isinstance(error, OSError) and error.filename is None and error.errno in _REFUSALS:
         return error.strerror or str(error), EXIT_FAILURE
@@ -98,6 +98,14 @@ def report_thread(args: threading.ExceptHookArgs) -> None:
     if args.exc_value is not None and not isinstance(args.exc_value, SystemExit):
         name = args.thread.name if args.thread is not None else "?"
         _log.error("thread %s ended: %s", name, describe(args.exc_value)[0])
+
+
+def _folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _log_folders() -> list[Path]:
