@@ -102,7 +102,7 @@ def report_thread(args: threading.ExceptHookArgs) -> None:
 
 def _folder_is_gone() -> bool:
     try:
-        os.getcwd()
+        Path.cwd()
     except FileNotFoundError:
         return True
     return False
