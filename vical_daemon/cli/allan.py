@@ -51,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     samples, remark = imu_data.at_rest(imu_data.load(args))
     if remark:
         print(f"vical: warning: {remark}", file=sys.stderr)
+    _refuse_constant(args.input, samples)
     curves: dict[str, list[AllanCurve]] = {"gyro": [], "accel": []}
     fits: dict[str, list[NoiseFit]] = {"gyro": [], "accel": []}
     for sensor, signal in (("gyro", samples.gyro_rps), ("accel", samples.accel_mps2)):
@@ -81,6 +82,22 @@ def run(args: argparse.Namespace) -> int:
 def _progress(args: argparse.Namespace, what: str) -> None:
     if sys.stderr.isatty() and not args.quiet:
         print(f"\r{what:<20}", end="\r" if not what else "", file=sys.stderr, flush=True)
+
+
+def _refuse_constant(path: str, samples: EvenSamples) -> None:
+    """Refuse readings without noise: they have no Allan deviation.
+
+    Raises:
+        CliError: A channel never changes.
+    """
+    import numpy as np
+
+    from vical_daemon.estimation.inertial.units import ImuArrays, constant_channels
+
+    t_ns = np.arange(len(samples.gyro_rps))
+    still = constant_channels(ImuArrays(t_ns, samples.gyro_rps, samples.accel_mps2))
+    if still:
+        raise CliError(f"{path}: {still}")
 
 
 def _document(

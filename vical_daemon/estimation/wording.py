@@ -279,6 +279,9 @@ _FACTORS = {"mm": 1e3, "ms": 1e3, "us": 1e6, "%": 100.0, "deg": _DEG, "deg/s": _
 """Figures in these units over those in SI units; others are as they are."""
 
 
+_MOST_DIGITS = 4  # after the point
+
+
 class _Figure:
     """Value of an event and, where known, its sigma, in a format such as ".1f ms"; `size`: without sign."""
 
@@ -289,10 +292,13 @@ class _Figure:
     def __format__(self, spec: str) -> str:
         form, unit = spec.split(" ", 1)
         factor = _FACTORS.get(unit.split()[0], 1.0)
-        value = format(factor * self._value, form)
         if self._sigma is None:
-            return f"{value} {unit}"
-        return f"{value} ± {format(factor * self._sigma, form.replace('+', ''))} {unit}"
+            return f"{format(factor * self._value, form)} {unit}"
+        digits = int(form.strip("+.f"))
+        while 0.0 < factor * self._sigma < 0.5 * 10**-digits and digits < _MOST_DIGITS:
+            digits += 1  # a sigma of 0.0 would say that the value is exact
+        form = f"{form.partition('.')[0]}.{digits}f"
+        return f"{factor * self._value:{form}} ± {factor * self._sigma:.{digits}f} {unit}"
 
 
 def _target_size(event: Event) -> str:

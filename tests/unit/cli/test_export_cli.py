@@ -211,6 +211,16 @@ def test_allan_mistakes(still_csv, capsys, words, code, says):
     assert says in capsys.readouterr().err
 
 
+def test_readings_that_never_change_have_no_noise(tmp_path, capsys):
+    path = tmp_path / "still.csv"
+    stamps = 1_700_000_000_000_000_000 + np.arange(2000) * 10_000_000
+    path.write_text("".join(f"{t},0.01,0,0,0,0,9.81\n" for t in stamps.tolist()))
+    assert main(["allan", str(path)]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"vical: error: {path}: not even noise changes gyro x (always 0.01)")
+    assert err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -72,6 +72,11 @@ def test_every_cause_has_a_text(cause):
             "by -50.0 ± 1.0 us per second; it is now estimated too",
         ),
         (
+            Event(EventKind.CLOCK_DRIFT, "cam0", -2.41e-6, 3e-8),  # not "± 0.0"
+            "cam0: the time shift drifts: the clocks of camera and IMU run at different rates, "
+            "by -2.41 ± 0.03 us per second; it is now estimated too",
+        ),
+        (
             Event(EventKind.TARGET_SIZE, value=-0.03),
             "the target is about 3 % smaller than stated: measure it; its size is estimated from now on",
         ),
