@@ -133,7 +133,8 @@ def test_the_exit_code_tells_whether_it_converged(
 ) -> None:
     changed = replace(outcome, estimate=replace(outcome.estimate, status=Status(status), guidance="nod"))
     monkeypatch.setattr(calibrate, "run_job", lambda *_, **__: changed)
-    assert main(_arguments(shortest, "--json", "--accept", accept)) == code
+    more = ["--accept", accept] if accept else []
+    assert main(_arguments(shortest, "--json", *more)) == code
     out, err = capsys.readouterr()
     assert json.loads(out)["status"] == status  # written in any case
     assert (f"{status}: " in err) == (status != "converged")
