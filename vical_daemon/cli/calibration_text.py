@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from vical_daemon.estimation.wording import digits_that_show
 from vical_daemon.results.euler import euler_deg, euler_sigma_deg
 
 
@@ -106,7 +107,8 @@ def _readout_lines(camera: dict[str, Any]) -> list[str]:
 
 def _row(name: str, values: list[float], sigmas: list[float] | None, unit: str, digits: int) -> str:
     if sigmas and any(sigmas):
-        text = "  ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(values, sigmas, strict=True))
+        pairs = [(v, s, digits_that_show(s, digits)) for v, s in zip(values, sigmas, strict=True)]
+        text = "  ".join(f"{v:.{shown}f} ± {s:.{shown}f}" for v, s, shown in pairs)
     else:
         text = "  ".join(f"{v:.{digits}f}" for v in values)
     return f"  {name:<22}{text} {unit}".rstrip()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
+from vical_daemon.estimation.wording import digits_that_show
 from vical_daemon.results.euler import euler_deg, euler_sigma_deg
 
 if TYPE_CHECKING:
@@ -23,22 +24,27 @@ def rows(camera: CameraEstimate) -> list[Row]:
     pose = camera.T_imu_cam
     sigma = [math.sqrt(max(pose.covariance[i][i], 0.0)) for i in range(6)]
     table = [
-        (f"position {axis}", f"{1e3 * p:.2f}", f"{1e3 * s:.2f}", "mm")
+        (f"position {axis}", *_with_sigma(1e3 * p, 1e3 * s, 2), "mm")
         for axis, p, s in zip("xyz", pose.p_m, sigma[:3], strict=True)
     ]
     angles, angle_sigmas = euler_deg(pose.q_wxyz), euler_sigma_deg(pose.q_wxyz, pose.covariance)
     table += [
-        (name, f"{angle:.3f}", f"{s:.3f}", "deg")
+        (name, *_with_sigma(angle, s, 3), "deg")
         for name, angle, s in zip(("roll", "pitch", "yaw"), angles, angle_sigmas, strict=True)
     ]
     shift, shift_sigma = camera.timeshift_cam_imu_s, camera.timeshift_sigma_s
-    table.append(("time shift", f"{1e3 * shift:.3f}", f"{1e3 * shift_sigma:.3f}", "ms"))
+    table.append(("time shift", *_with_sigma(1e3 * shift, 1e3 * shift_sigma, 3), "ms"))
     if any(camera.intrinsics_sigma):
         for name, value, s in zip(
             ("fx", "fy", "cx", "cy"), camera.intrinsics, camera.intrinsics_sigma, strict=True
         ):
-            table.append((name, f"{value:.2f}", f"{s:.2f}", "px"))
+            table.append((name, *_with_sigma(value, s, 2), "px"))
     return table
+
+
+def _with_sigma(value: float, sigma: float, digits: int) -> tuple[str, str]:
+    shown = digits_that_show(sigma, digits)
+    return f"{value:.{shown}f}", f"{sigma:.{shown}f}"
 
 
 def one_line(camera: str, estimate: CalibrationEstimate) -> str:
@@ -46,10 +52,11 @@ def one_line(camera: str, estimate: CalibrationEstimate) -> str:
     known = estimate.cameras.get(camera)
     text = f"{estimate.duration_s:6.1f} s  {camera}  {estimate.status:<12} {estimate.progress:4.0%}"
     if known is not None:
-        p = " ".join(f"{1e3 * v:.1f}" for v in known.T_imu_cam.p_m)
-        sigma = max(math.sqrt(max(known.T_imu_cam.covariance[i][i], 0.0)) for i in range(3))
-        shift, shift_sigma = 1e3 * known.timeshift_cam_imu_s, 1e3 * known.timeshift_sigma_s
-        text += f"  p {p} ± {1e3 * sigma:.1f} mm  shift {shift:.2f} ± {shift_sigma:.2f} ms"
+        sigma_mm = 1e3 * max(math.sqrt(max(known.T_imu_cam.covariance[i][i], 0.0)) for i in range(3))
+        digits = digits_that_show(sigma_mm, 1)
+        p = " ".join(f"{1e3 * v:.{digits}f}" for v in known.T_imu_cam.p_m)
+        shift, shift_sigma = _with_sigma(1e3 * known.timeshift_cam_imu_s, 1e3 * known.timeshift_sigma_s, 2)
+        text += f"  p {p} ± {sigma_mm:.{digits}f} mm  shift {shift} ± {shift_sigma} ms"
     return text + (
         f"  {estimate.guidance or estimate.reason}" if estimate.guidance or estimate.reason else ""
     )

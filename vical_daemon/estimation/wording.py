@@ -279,7 +279,11 @@ _FACTORS = {"mm": 1e3, "ms": 1e3, "us": 1e6, "%": 100.0, "deg": _DEG, "deg/s": _
 """Figures in these units over those in SI units; others are as they are."""
 
 
-_MOST_DIGITS = 4  # after the point
+def digits_that_show(sigma: float, digits: int) -> int:
+    """Digits after the point, `digits` or more, with which a sigma is not 0.0: that would say it is exact."""
+    while 0.0 < sigma < 0.5 * 10.0**-digits:
+        digits += 1
+    return digits
 
 
 class _Figure:
@@ -294,9 +298,7 @@ class _Figure:
         factor = _FACTORS.get(unit.split()[0], 1.0)
         if self._sigma is None:
             return f"{format(factor * self._value, form)} {unit}"
-        digits = int(form.strip("+.f"))
-        while 0.0 < factor * self._sigma < 0.5 * 10**-digits and digits < _MOST_DIGITS:
-            digits += 1  # a sigma of 0.0 would say that the value is exact
+        digits = digits_that_show(factor * self._sigma, int(form.strip("+.f")))
         form = f"{form.partition('.')[0]}.{digits}f"
         return f"{factor * self._value:{form}} ± {factor * self._sigma:.{digits}f} {unit}"
 

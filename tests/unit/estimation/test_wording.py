@@ -13,6 +13,7 @@ from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection, of_camera
 from vical_daemon.estimation.wording import (
     cause_text,
+    digits_that_show,
     direction_line,
     direction_sigma,
     event_document,
@@ -154,3 +155,9 @@ def test_events_are_stamped_once_and_taken_once():
         (EventKind.POSE_LOST, 4.0),
     ]
     assert log.take() == []
+
+
+@pytest.mark.parametrize(("sigma", "digits"), [(0.0, 2), (0.3, 2), (0.006, 2), (0.004, 3), (2e-6, 6)])
+def test_a_sigma_is_not_shown_as_zero(sigma, digits):
+    assert digits_that_show(sigma, 2) == digits
+    assert (float(f"{sigma:.{digits}f}") > 0.0) == (sigma > 0.0)
