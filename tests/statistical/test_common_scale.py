@@ -1,10 +1,11 @@
 """A factor common to target, lever arm, gravity and accelerometer shows in no image: it must not drift."""
 
 import numpy as np
-from vical_mocks.points import simulate
+from vical_mocks.harness.feed import events_in_order, points_frame
+from vical_mocks.points import SimulatedFrame, simulate
 
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 
 
 def test_many_images_do_not_move_the_scale_of_everything():
@@ -12,15 +13,12 @@ def test_many_images_do_not_move_the_scale_of_everything():
     prior = CameraPrior(resolution=(640, 480), intrinsics=(510.0, 510.0, 320.0, 240.0))
     options = CalibrationOptions()
     calibrator = Calibrator(options, {"cam0": prior}, run.points_m)
-    frames = iter(run.frames)
-    frame = next(frames, None)
-    samples = zip(run.t_imu_ns.tolist(), run.gyro_rps, run.specific_force_mps2, strict=True)
-    for t_ns, gyro, force in samples:
-        calibrator.add_imu(t_ns, gyro, force)
-        while frame is not None and frame.t_cam_ns <= t_ns:
-            calibrator.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
+    for _, event in events_in_order(run):
+        if isinstance(event, SimulatedFrame):
+            calibrator.add_points(points_frame(event))
             calibrator.process()
-            frame = next(frames, None)
+        else:
+            calibrator.add_imu(int(run.t_imu_ns[event]), run.gyro_rps[event], run.specific_force_mps2[event])
     state = calibrator.filter.state
     known = options.gravity_sigma_mps2 / options.gravity_mps2  # all that is known of the factor
     off = [np.linalg.norm(state.gravity) / options.gravity_mps2, state.target_scale, state.accel_matrix[0, 0]]
