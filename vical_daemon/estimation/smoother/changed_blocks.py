@@ -28,6 +28,9 @@ _WINDOWS = 5
 """Estimates looked back at: some 15 s. After as long, a move is a change like any other: windows disagree."""
 _INFORMED = 0.02
 """Share of the old variance that the data between must take away in a direction, to say anything about it."""
+_WRONG = 0.1
+"""Share of the old variance by which the difference of two covariances may be wrong, before a move is certain:
+errors that last make both wrong, and their difference is small. [docs/design/target_free.md, "Doubts ..."]"""
 
 
 def mounting(layout: Layout) -> tuple[int, ...]:
@@ -90,13 +93,16 @@ def _square(
     return float(e @ np.linalg.solve(C + A @ P[np.ix_(both, both)] @ A.T, e))
 
 
-def square_of_change(change: FloatArray, before: FloatArray, after: FloatArray) -> tuple[float, int]:
+def square_of_change(
+    change: FloatArray, before: FloatArray, after: FloatArray, wrong: float = 0.0
+) -> tuple[float, int]:
     """How far an estimate moved, against how far new data may move it.
 
     Args:
         change: New minus old, shape (n,).
         before: Covariance of the old one, shape (n, n).
         after: Of the new one, likewise.
+        wrong: Share of the old variance by which the difference of the two may be too small.
 
     Returns:
         Sum of squares over the directions that the new data show, and their number.
@@ -105,7 +111,8 @@ def square_of_change(change: FloatArray, before: FloatArray, after: FloatArray) 
     values, vectors = np.linalg.eigh((before - after) / np.outer(scale, scale))
     informed = values > _INFORMED
     d = vectors.T @ (change / scale)
-    return float((d[informed] ** 2 / values[informed]).sum()), int(np.count_nonzero(informed))
+    square = (d[informed] ** 2 / (values[informed] + wrong)).sum()
+    return float(square), int(np.count_nonzero(informed))
 
 
 class _Mounting(NamedTuple):
@@ -154,10 +161,11 @@ class MountingWatch:
             for block in (where.position, where.rotation):
                 if block is None:
                     continue
-                square, dof = square_of_change(d[block], before[block, block], covariance[block, block])
+                moved = d[block], before[block, block], covariance[block, block]
+                (square, dof), (at_least, _) = square_of_change(*moved), square_of_change(*moved, _WRONG)
                 if dof:
                     self._doubted |= square > factor * chi_square_limit(dof, LIKELY_SIGMAS)
-                    self.surely |= square > factor * chi_square_limit(dof, SURE_SIGMAS)
+                    self.surely |= at_least > factor * chi_square_limit(dof, SURE_SIGMAS)
         self.doubtful |= self._doubted
 
     def window_done(self) -> None:
