@@ -11,6 +11,7 @@ from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import GRAVITY, LOWER, CameraState, State, make_layout
+from vical_daemon.estimation.model.unscented import upper_root
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
@@ -89,8 +90,8 @@ def some_filter(imu=1.0, target=0.0, lag=0.0, size=0.0, factor=1.0, scale=1.0):
     consistency = Consistency()
     consistency.factor, consistency.scale = factor, scale
     f = CalibrationFilter(
-        retract(start, layout, x), layout, np.linalg.cholesky(P), ImuNoise(), {NAME: CornerNoise(0.5)},
-        np.zeros(n), {NAME: consistency}, {NAME: LensAgreement()},
+        retract(start, layout, x), layout, upper_root(np.linalg.cholesky(P)), ImuNoise(),
+        {NAME: CornerNoise(0.5)}, np.zeros(n), {NAME: consistency}, {NAME: LensAgreement()},
     )  # fmt: skip
     return f, x, P, dense
 

@@ -57,6 +57,7 @@ from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GRAVITY_
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
+    BIASES,
     GRAVITY,
     GYRO_BIAS,
     MOTION,
@@ -80,7 +81,7 @@ class CalibrationFilter:
     Attributes:
         state: Nominal state at `state.t_s`.
         layout: Where the errors live.
-        S: Lower-triangular square root of the covariance, shape (n, n).
+        S: Upper-triangular square root of the covariance, shape (n, n).
         imu_noise: Densities.
         corner_noise: Measured corner noise by camera.
         walk: Variance per second added to each error outside the motion model (drift of the time shift,
@@ -140,7 +141,7 @@ class CalibrationFilter:
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
         if self.jumped is not None:
-            self.jumped.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
+            self.jumped.predict(moved.linear, self.S)
             self._drift(self.jumped.D, self.jumped.D, moved.seconds)
         self._grow(moved, Q)
         self._predict_score(moved, Q)
@@ -168,8 +169,7 @@ class CalibrationFilter:
 
     def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
         """Motion at the end of a segment, and covariance of the process noise."""
-        d = self.layout.dynamic
-        S = self.S[:d, :d]
+        S = self.S[: self.layout.dynamic]
         sigmas = np.sqrt(np.vecdot(S, S))
         straight = self._motion_straight.holds(sigmas)
         if straight:
@@ -183,15 +183,15 @@ class CalibrationFilter:
         return moved, Q
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
-        """Assemble the columns of the new square root and make it triangular."""
-        d, c = self.layout.dynamic, moved.curved.shape[1]
-        A = self.S.copy()
-        A[:9, :d] = moved.linear
-        self._drift_shifts(A, moved.seconds)
+        """Move the rows of the square root, and add the noise."""
+        c, before, S = moved.curved.shape[1], self.S, self.S.copy()
+        S[MOTION] = moved.linear
+        self._drift_shifts(S, moved.seconds)
         noise = self._random_walk(moved.seconds, after=c + 9)
-        noise[:9, :c] = moved.curved
-        noise[:9, c : c + 9] = unscented.root(Q)
-        before, self.S = self.S, unscented.lower_root_grown(A, noise, d)
+        noise[MOTION, :c] = moved.curved
+        noise[MOTION, c : c + 9] = unscented.root(Q)
+        unscented.grow(S, noise)
+        self.S = S
         self.passed.append(Moved(before, self.S, moved.linear, moved.seconds))
 
     # ------------------------------------------------------------------ update
@@ -400,7 +400,7 @@ class CalibrationFilter:
     def inflate_covariance(self, columns: FloatArray) -> None:
         """Add the covariance `columns columns'`; directions of the errors, shape (n,) or (n, k)."""
         added = columns.reshape(self.layout.size, -1)
-        self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
+        self.S = unscented.upper_root(np.concatenate([self.S, added], axis=1))
 
     def restart_motion(self, motion: MotionStart) -> None:
         """Replace the motion and keep the calibration, with process noise up to that time.
@@ -421,13 +421,15 @@ class CalibrationFilter:
             size_rows = np.outer(after, before @ self.S[GRAVITY])
             state.gyro_bias, state.accel_bias, state.gravity = b.gyro_bias, b.accel_bias, b.gravity
         new = len(root)  # motion, or all up to gravity
-        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, new))], axis=1)
+        walked = self._random_walk(dt)
+        A = np.concatenate([self.S, np.zeros((self.layout.size, walked.shape[1] + new))], axis=1)
+        A[: len(walked), self.layout.size : -new] = walked
         self._drift_shifts(A, dt)
         A[:new] = 0.0
         A[new - len(size_rows) : new, : self.layout.size] = size_rows
         A[:new, -new:] = root
-        before, self.S = self.S, unscented.lower_root(A)
-        self.passed.append(Moved(before, self.S, np.zeros((9, self.layout.dynamic)), dt))
+        before, self.S = self.S, unscented.upper_root(A)
+        self.passed.append(Moved(before, self.S, np.zeros((9, self.layout.size)), dt))
         self.arm_score = None
         state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
@@ -444,9 +446,12 @@ class CalibrationFilter:
         self.inflate_covariance(in_doubt)
 
     def _random_walk(self, dt: float, after: int = 0) -> FloatArray:
-        """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros, (n, k)."""
+        """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros.
+
+        Of all errors up to the last that wanders, shape (m, k).
+        """
         drift = self.walk.nonzero()[0]
-        columns = np.zeros((self.layout.size, after + 6 + len(drift)))
+        columns = np.zeros((max([BIASES.stop, *drift + 1]), after + 6 + len(drift)))
         noise, root_s = self.imu_noise, math.sqrt(dt)
         columns[GYRO_BIAS, after : after + 3] = (noise.gyro_walk * root_s) * so3.IDENTITY
         columns[ACCEL_BIAS, after + 3 : after + 6] = (noise.accel_walk * root_s) * so3.IDENTITY

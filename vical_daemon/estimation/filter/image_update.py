@@ -161,7 +161,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
         fit.again = step > 0
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
-        step_size = unscented.solve_lower(fit.S, fit.dx - dx)
+        step_size = unscented.solve_upper(fit.S, fit.dx - dx)
         S, dx, keep = fit.S, fit.dx, fit.keep
         if step and float(np.linalg.norm(step_size)) < 0.05:
             break
@@ -191,13 +191,13 @@ def _correct(
         rows = rows_of(keep)
         kept, r_kept = ways[rows], r[rows]
         R, r_small, rest, dof_rest = unscented.compress(kept, r_kept)
-        small = np.concatenate([R[:, :k] @ moves, R[:, k:]], axis=1)
+        small = np.concatenate([R[:, k:], R[:, :k] @ moves], axis=1)
         # Rows that no state moves are residuals like the rest, and say nothing about whether innovations fit.
         apart, count = _unmoved(small, r_small) if dof_rest else (0.0, 0)
         rest, dof_rest = rest + apart, dof_rest + count
         noise = noise_of_image(rest * image.scale, dof_rest)
         c = unscented.correct(prior, small / noise, r_small / noise)
-        moved = np.concatenate([moves @ c.solution[:known], c.solution[known:]])
+        moved = np.concatenate([moves @ c.solution[-known:], c.solution[:-known]])
         left = (r - ways @ moved).reshape(-1, 2)
         bad = keep & (np.vecdot(left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or np.count_nonzero(keep & ~bad) < LEAST_POINTS:

@@ -18,7 +18,8 @@ import numpy as np
 
 from vical_daemon.estimation.filter.passed import Corrected, Moved, by_step, said
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.unscented import RIDGE, solve_lower, unit
+from vical_daemon.estimation.model.state import MOTION
+from vical_daemon.estimation.model.unscented import RIDGE, solve_upper, unit
 
 SIZES = 3.0 ** -np.arange(5)
 """Sizes that a jump may have, over one sigma of the largest, all equally likely a priori: nobody knows how
@@ -75,14 +76,14 @@ class JumpScores(NamedTuple):
             for done in reversed(run[k]):
                 after = done.carried if isinstance(done, Corrected) else done.after
                 if after is not root:  # an error was reopened, or errors mean something else now
-                    A, b = _before(A, b, solve_lower(root, after))
+                    A, b = _before(A, b, solve_upper(root, after))
                 A, b = _before(A, b, by_step(done, drifts))
                 if isinstance(done, Corrected):
                     J, j = said(done)
-                    spread = done.moves[:, :n]
+                    spread = done.moves[:, -n:]
                     A, b = A + spread.T @ J @ spread, b + j @ spread
                 root = done.before
-            D = solve_lower(root, columns[k])
+            D = solve_upper(root, columns[k])
             information[k], weighted[k] = D.T @ A @ D, b @ D
         return cls(information, weighted)
 
@@ -128,10 +129,10 @@ class JumpSizes:
         """Propagate.
 
         Args:
-            linear: F S of the motion by the dynamic errors, shape (9, d).
-            S: Square root of their covariance before, shape (d, d).
+            linear: F S of the motion, shape (9, n).
+            S: Square root of the covariance before, shape (n, n).
         """
-        self.D[:9] = linear @ solve_lower(S, self.D[: len(S)])
+        self.D[MOTION] = linear @ solve_upper(S, self.D)
 
     def correct(self, before: FloatArray, after: FloatArray, dx: FloatArray) -> None:
         """Take a correction of the state.
@@ -141,9 +142,9 @@ class JumpSizes:
             after: Likewise, of the corrected state.
             dx: Step of the state, shape (n,).
         """
-        normal = solve_lower(before, np.concatenate([self.D, dx[:, None]], axis=1))
+        normal = solve_upper(before, np.concatenate([self.D, dx[:, None]], axis=1))
         by_jump = normal[:, :-1]
-        left = after.T @ solve_lower(before, by_jump, transposed=True)
+        left = after.T @ solve_upper(before, by_jump, transposed=True)
         self.mean = self.mean + by_jump.T @ normal[:, -1]
         self.covariance = self.covariance - by_jump.T @ by_jump + left.T @ left
         self.D = after @ left

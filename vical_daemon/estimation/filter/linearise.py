@@ -91,8 +91,8 @@ class Linear:
 
     @cached_property
     def moves(self) -> FloatArray:
-        """Square root of how far states and what corners share move the image, shape (k, c + r)."""
-        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
+        """Square root of how far what corners share and states move the image, shape (k, r + c)."""
+        return np.concatenate([self.shared, self.spread], axis=1) if self.shared.size else self.spread
 
 
 def project_errors(
@@ -222,7 +222,8 @@ def by_sigma_points(
     Derivatives refer to the rows at which corners are expected: at the measured rows they would contain the
     noise of the corners, and pass for information. The mean refers to the measured rows.
     """
-    errors = dx + unscented.offsets(S)
+    L = unscented.lower_root(S)
+    errors = dx + unscented.offsets(L)
     project = partial(project_errors, state, layout, rates, image.camera, image.t_cam_s, image.points)
     if is_rolling(state, layout, image.camera):
         pixels = project(project(None, errors[:1])[0], errors)
@@ -233,10 +234,9 @@ def by_sigma_points(
         valid: BoolArray = np.asarray((np.abs(pixels) < MOST_PX).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
-    # the columns of S are the ways
-    by_error = unscented.solve_lower(S, np.eye(len(S)))
-    unit, none = np.eye(len(S)), np.zeros((len(S), 0))
-    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, unit, m.curved, valid, none)
+    # the columns of L are the ways
+    by_error, none = unscented.solve_lower(L, unscented.unit(len(S))), np.zeros((len(S), 0))
+    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, by_error @ S, m.curved, valid, none)
 
 
 def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:

@@ -145,7 +145,7 @@ class LinearisedFilter(CalibrationFilter):
         for shift, rate in self.layout.drifts:
             self.offset[shift] += moved.seconds * self.offset[rate]
         Q = moved.influence.noise(self.imu_noise)
-        self._grow(moved._replace(linear=moved.linear @ self.S[:d, :d]), Q)
+        self._grow(moved._replace(linear=moved.linear @ self.S[:d]), Q)
         self._predict_score(moved, Q)
         state.t_s = float(segment.t_s[-1])
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.unscented import solve_lower, unit
+from vical_daemon.estimation.model.state import MOTION
+from vical_daemon.estimation.model.unscented import solve_upper, unit
 
 
 class Moved(NamedTuple):
@@ -21,7 +22,7 @@ class Moved(NamedTuple):
     Attributes:
         before: Square root of the covariance before, shape (n, n).
         after: Square root of the covariance afterwards, shape (n, n).
-        linear: F `before` of the motion by the dynamic errors, shape (9, d).
+        linear: F `before` of the motion, shape (9, n).
         seconds: For how long.
     """
 
@@ -40,7 +41,7 @@ class Corrected(NamedTuple):
         carried: What its columns are as errors of the corrected state, see `Reset`, shape (n, n).
         ways: The whitened corners by the ways in which the image can move, shape (m, w).
         innovation: Theirs, shape (m,).
-        moves: Square root of how far the state, and then what corners share, move the image: (w, c).
+        moves: Square root of how far what corners share, and then the state, move the image: (w, c).
     """
 
     before: FloatArray
@@ -54,12 +55,12 @@ class Corrected(NamedTuple):
 def by_step(done: Moved | Corrected, drifts: Sequence[tuple[int, int]]) -> FloatArray:
     """Errors after a step by those before it, in columns of the roots, shape (n, n)."""
     if isinstance(done, Corrected):
-        return np.asarray(solve_lower(done.before, done.after).T)  # 1 - K H = P+ P^-1
+        return np.asarray(solve_upper(done.before, done.after).T)  # 1 - K H = P+ P^-1
     carried = done.before.copy()
-    carried[:9, : done.linear.shape[1]] = done.linear
+    carried[MOTION] = done.linear
     for shift, rate in drifts:
         carried[shift] += done.seconds * done.before[rate]
-    return solve_lower(done.after, carried)
+    return solve_upper(done.after, carried)
 
 
 def said(image: Corrected) -> tuple[FloatArray, FloatArray]:
@@ -83,10 +84,10 @@ def smoothed(run: Sequence[Moved | Corrected], drifts: Sequence[tuple[int, int]]
     for done in reversed(run):
         after = done.carried if isinstance(done, Corrected) else done.after
         if after is not root:
-            said_later = said_later @ solve_lower(root, after)
+            said_later = said_later @ solve_upper(root, after)
         said_later = said_later @ by_step(done, drifts)
         if isinstance(done, Corrected):
-            said_later = said_later + said(done)[1] @ done.moves[:, :n]
+            said_later = said_later + said(done)[1] @ done.moves[:, -n:]
             out.append(done.before @ said_later)
         root = done.before
     return out[::-1]

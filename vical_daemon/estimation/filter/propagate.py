@@ -38,7 +38,7 @@ class Propagated(NamedTuple):
 
     Attributes:
         R, p, v: Mean.
-        linear: F S of [attitude, position, velocity], shape (9, d).
+        linear: F S of [attitude, position, velocity], shape (9, n).
         curved: Square root of the second-order covariance, shape (9, k); k = 0 by derivatives.
         influence: What errors of the readings do to it.
         slopes: Of itself by the motion at the start and constant biases, shape (9, 15).
@@ -56,8 +56,9 @@ class Propagated(NamedTuple):
 
 
 def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Propagated:
-    """Statistical linearisation of the strapdown equations over one segment; S of the dynamic errors."""
-    points = motion_points(state, layout, unscented.offsets(S))
+    """Statistical linearisation of the strapdown equations over a segment; S: rows of the dynamic errors."""
+    L = unscented.lower_root(S)
+    points = motion_points(state, layout, unscented.offsets(L))
     relative = strapdown(
         segment,
         points.gyro_bias,
@@ -77,7 +78,7 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
         end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]),
         end.p[0] + m.shift[POSITION],
         end.v[0] + m.shift[VELOCITY],
-        m.linear,
+        m.linear @ unscented.solve_lower(L, S),
         m.curved,
         errors,
         motion_slopes(state, relative, errors),

@@ -31,7 +31,7 @@ class Reset(NamedTuple):
 
     Attributes:
         state: The state.
-        S: Lower-triangular square root of its covariance, shape (n, n).
+        S: Upper-triangular square root of its covariance, shape (n, n).
         before: The same by errors of before, but for turns.
         carried: The errors that its columns have become, shape (n, n).
     """
@@ -73,7 +73,9 @@ def move(
     columns[0] = carried
     for X in columns:
         X[POSITION] += before.by(X) - after.by(X)
-    return Reset(moved, unscented.lower_root(carried), S, carried)
+    triangular = carried.copy()
+    unscented.grow(triangular, np.zeros((POSITION.stop, 0)))
+    return Reset(moved, triangular, S, carried)
 
 
 def displaced(state: State, layout: Layout, dx: FloatArray, camera: str) -> State:

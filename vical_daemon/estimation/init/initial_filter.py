@@ -82,7 +82,7 @@ def initial_filter(
     return CalibrationFilter(
         state,
         layout,
-        unscented.lower_root(root),
+        unscented.upper_root(root),
         options.imu_noise,
         noise,
         walk,

@@ -1,4 +1,6 @@
-"""Sigma-point linear algebra on a square-root covariance: P = S S^T with S lower triangular, always.
+"""Sigma-point linear algebra on a square-root covariance: P = S S^T with S upper triangular, always.
+
+The errors that come first are those that move. Noise that they gather changes their own corner of S only.
 
 The transform is the symmetric sigma-point set with spread sqrt(3) in its divided-difference form
 [Norgaard, Poulsen & Ravn, "New developments in state estimation for nonlinear systems", 2000, DD2]: mean and
@@ -13,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrf, dtpqrt, dtrtrs
+from scipy.linalg.lapack import dgeqrf, dgerqf, dorgrq, dpotrf, dtpqrt, dtrtrs
 
 from vical_daemon.estimation.measurements import FloatArray
 
@@ -41,6 +43,11 @@ def solve_lower(L: FloatArray, b: FloatArray, *, transposed: bool = False) -> Fl
     if info:
         raise np.linalg.LinAlgError(f"triangular factor is singular at row {info - 1}")
     return np.asarray(x)
+
+
+def solve_upper(U: FloatArray, b: FloatArray, *, transposed: bool = False) -> FloatArray:
+    """The same for upper-triangular U."""
+    return solve_lower(U.T, b, transposed=not transposed)
 
 
 def root(P: FloatArray) -> FloatArray:
@@ -88,53 +95,55 @@ def moments(values: FloatArray) -> Moments:
 
 
 def lower_root(columns: FloatArray) -> FloatArray:
-    """Return lower-triangular L with L L^T = A A^T for A (n, k), k >= n, by QR; its diagonal is >= 0."""
+    """Return lower-triangular L with L L^T = A A^T for A (n, k), k >= n; its columns give sigma points."""
+    L: FloatArray = triangle(columns.T).T
+    return L * np.copysign(1.0, L.diagonal())
+
+
+def upper_root(columns: FloatArray) -> FloatArray:
+    """Return upper-triangular U with U U^T = A A^T for A (n, k), k >= n, by RQ; its diagonal is >= 0."""
     n = columns.shape[0]
-    qr, _, _, _ = dgeqrf(columns.T)
-    L: FloatArray = qr[:n].T * _lower(n)
-    L *= np.copysign(1.0, L.diagonal())
-    return L
+    rq, _, _, _ = dgerqf(columns)
+    U: FloatArray = rq[:, -n:] * _upper(n)
+    U *= np.copysign(1.0, U.diagonal())
+    return U
 
 
-def lower_root_grown(A: FloatArray, columns: FloatArray, d: int) -> FloatArray:
-    """Return lower-triangular L with L L^T = A A^T + C C^T, in two smaller QRs than `lower_root` of [A C].
+def grow(U: FloatArray, columns: FloatArray) -> None:
+    """Add C C^T to U U^T, in place; U becomes upper triangular.
 
     Args:
-        A: Square; its first `d` rows are zero from column `d` on, shape (n, n).
-        columns: C, shape (n, k).
-        d: Number of leading rows.
+        U: Upper triangular but for its first rows, in the first k columns; shape (n, n).
+        columns: C of the first k errors, zero for the others; shape (k, m).
     """
-    R = upper_root(np.concatenate([A[:, :d], columns], axis=1).T)
-    L = np.zeros(A.shape)
-    L[:, :d] = R[:d].T * np.copysign(1.0, R.diagonal()[:d])
-    L[d:, d:] = lower_root(np.concatenate([A[d:, d:], R[d:, d:].T], axis=1))
-    return L
+    k = len(columns)
+    U[:k, :k] = upper_root(np.concatenate([U[:k, :k], columns], axis=1))
 
 
 def turn_rows(S: FloatArray, where: slice, J: FloatArray) -> None:
-    """Multiply rows of a lower-triangular S by a square J from the left, in place; S stays lower triangular.
+    """Multiply rows of an upper-triangular S by a square J from the left, in place; S stays upper triangular.
 
     Only the diagonal block of these rows loses its form; a rotation of its columns restores it.
     """
-    turned = J @ S[where, where]
-    qr, tau, _, _ = dgeqrf(turned.T)
-    Q = dorgqr(qr, tau)[0] * np.where(qr.diagonal() < 0.0, -1.0, 1.0)
-    S[where, : where.start] = J @ S[where, : where.start]
-    S[where, where] = (turned @ Q) * _lower(len(Q))
-    S[where.stop :, where] = S[where.stop :, where] @ Q
+    rq, tau, _, _ = dgerqf(J @ S[where, where])
+    sign = np.copysign(1.0, rq.diagonal())
+    Q = dorgrq(rq, tau)[0].T * sign
+    S[where, where.stop :] = J @ S[where, where.stop :]
+    S[where, where] = rq * _upper(len(Q)) * sign
+    S[: where.start, where] = S[: where.start, where] @ Q
 
 
-def upper_root(rows: FloatArray) -> FloatArray:
+def triangle(rows: FloatArray) -> FloatArray:
     """Return R, zero below the diagonal, with R^T R = A^T A for A (m, n), by QR; shape (min(m, n), n)."""
     qr, _, _, _ = dgeqrf(rows)
     R: FloatArray = qr[: rows.shape[1]]
-    return R * _lower(R.shape[1]).T[: len(R)]
+    return R * _upper(R.shape[1])[: len(R)]
 
 
 @lru_cache(maxsize=64)
-def _lower(n: int) -> FloatArray:
-    """Ones on and below the diagonal (numpy's `tril` makes them at each call)."""
-    return np.tri(n)
+def _upper(n: int) -> FloatArray:
+    """Ones on and above the diagonal (numpy's `triu` makes them at each call)."""
+    return np.tri(n).T
 
 
 @lru_cache(maxsize=64)
@@ -162,7 +171,7 @@ def compress(M: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, floa
     stacked = np.empty((m, n + 1), order="F")
     stacked[:, :n] = M
     stacked[:, n] = r
-    top = upper_root(stacked)
+    top = triangle(stacked)
     return top[:n, :n], top[:n, n], float(top[n, n] ** 2), m - n
 
 
@@ -170,10 +179,10 @@ class Correction(NamedTuple):
     """Result of one linear correction.
 
     Attributes:
-        S: New square root, lower triangular, shape (n, n).
+        S: New square root, upper triangular, shape (n, n).
         dx: State correction, shape (n,).
         nis: Normalised innovation squared of the rows given.
-        solution: Most likely e and common c, shape (n + k,): dx = S_old e.
+        solution: Most likely common c and e, shape (k + n,): dx = S_old e.
         log_det: Logarithm of the determinant of the innovation's covariance, whitened.
     """
 
@@ -185,27 +194,27 @@ class Correction(NamedTuple):
 
 
 def correct(S: FloatArray, M: FloatArray, r: FloatArray) -> Correction:
-    """Kalman update in square-root form for whitened rows r = M [e c] + unit noise, e and c ~ N(0, I).
+    """Kalman update in square-root form for whitened rows r = M [c e] + unit noise, c and e ~ N(0, I).
 
-    With Lambda lower triangular, Lambda^T Lambda = I + M^T M: S+ = S Lambda^-1 (top left),
+    With Lambda upper triangular, Lambda^T Lambda = I + M^T M: S+ = S Lambda^-1 (bottom right),
     dx = S+ y, y = Lambda^-T M^T r, NIS = r^T r - y^T y.
 
     Args:
-        S: Square root of the covariance, lower triangular, (n, n).
-        M: H S of the whitened rows, then columns of noise c shared by rows (stamp jitter, curvature), if
-            any, shape (m, n + k).
+        S: Square root of the covariance, upper triangular, (n, n).
+        M: Columns of noise c shared by rows (stamp jitter, curvature), if any, then H S of the whitened rows,
+            shape (m, k + n).
         r: Whitened innovation, shape (m,).
 
     Returns:
         The correction.
     """
     n, k = S.shape[0], M.shape[1]
-    # QR of [I; M] with columns in reverse, which costs half as much where the rows of I are known to be that
-    Lambda = np.asfortranarray(dtpqrt(0, min(k, _BLOCK), unit(k), M[:, ::-1])[0][::-1, ::-1])
-    y = solve_lower(Lambda, M.T @ r, transposed=True)
-    new = dtrsm(1.0, Lambda[:n, :n], S, side=1, lower=1)  # zeros above the diagonal stay zero
-    dx = new @ y[:n]
+    # QR of [I; M], which costs half as much where the rows of I are known to be that
+    Lambda = dtpqrt(0, min(k, _BLOCK), unit(k), M)[0]
+    y = solve_upper(Lambda, M.T @ r, transposed=True)
+    new = dtrsm(1.0, Lambda[k - n :, k - n :], S, side=1, lower=0)  # zeros below the diagonal stay zero
+    dx = new @ y[k - n :]
     new *= np.copysign(1.0, new.diagonal())
-    solution = solve_lower(Lambda, y)
+    solution = solve_upper(Lambda, y)
     log_det = 2.0 * float(np.log(np.abs(Lambda.diagonal())).sum())
     return Correction(new, dx, float(r @ r - y @ y), solution, log_det)

@@ -10,7 +10,7 @@ from vical_mocks.rig import Bump, reference_rig
 from vical_daemon.estimation.filter.jump_scores import SIZES, JumpScores, JumpSizes
 from vical_daemon.estimation.filter.passed import Corrected, Moved
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.model.unscented import solve_lower
+from vical_daemon.estimation.model.unscented import solve_upper, upper_root
 
 IMAGES, SIGMA = 12, np.array([0.7, 0.4])
 NOISE, SECONDS, DRIFTS = 1e-3 * np.eye(12), 0.3, [(11, 10)]
@@ -46,13 +46,13 @@ def run(F, images, jump_at=None, size=1.0):
         V = np.eye(5) + H @ P @ H.T
         r = z - H @ mean
         total -= 0.5 * (r @ np.linalg.solve(V, r) + np.linalg.slogdet(V)[1])
-        L = np.linalg.cholesky(P)
+        L = upper_root(np.linalg.cholesky(P))
         K = P @ H.T @ np.linalg.inv(V)
         mean, P = mean + K @ r, P - K @ H @ P
-        after = np.linalg.cholesky(P)
+        after = upper_root(np.linalg.cholesky(P))
         seen = Corrected(L, after, after, ways, r, by_error @ L)
         mean, P = F @ mean, F @ P @ F.T + NOISE
-        passed.append([seen, Moved(after, np.linalg.cholesky(P), F[:9, :9] @ after[:9, :9], SECONDS)])
+        passed.append([seen, Moved(after, upper_root(np.linalg.cholesky(P)), F[:9] @ after, SECONDS)])
     return total, JumpScores.of(passed, [columns] * IMAGES, DRIFTS)
 
 
@@ -75,17 +75,17 @@ def estimated(F, images, size):
     motion = np.eye(14)
     motion[:12, :12] = F
     for ways, by_error, z in images:
-        L = np.linalg.cholesky(joint[:12, :12])
+        L = upper_root(np.linalg.cholesky(joint[:12, :12]))
         H = np.concatenate([ways @ by_error, np.zeros((5, 2))], axis=1)
         r = z - H @ mean
         V = np.eye(5) + H @ joint @ H.T
         total -= 0.5 * (r @ np.linalg.solve(V, r) + np.linalg.slogdet(V)[1])
         K = joint @ H.T @ np.linalg.inv(V)
         mean, joint = mean + K @ r, joint - K @ H @ joint
-        dx, after = (K @ r)[:12], np.linalg.cholesky(joint[:12, :12])
+        dx, after = (K @ r)[:12], upper_root(np.linalg.cholesky(joint[:12, :12]))
         jumped.correct(L, after, dx)
         L = after
-        jumped.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
+        jumped.predict(F[:9] @ L, L)
         jumped.D[11] += SECONDS * jumped.D[10]  # as the filter does
         mean, joint = motion @ mean, motion @ joint @ motion.T
     return total, size**2 * (mean[12:] ** 2 + np.diag(joint)[12:]), jumped
@@ -107,7 +107,7 @@ def test_a_jump_is_never_known_better_than_the_state_after_it(monkeypatch):
     ordinary, least = JumpSizes.correct, []
 
     def correct(self, before, after, dx):
-        by_jump = solve_lower(before, self.D)
+        by_jump = solve_upper(before, self.D)
         least.append(np.linalg.eigvalsh(self.covariance - by_jump.T @ by_jump)[0])
         ordinary(self, before, after, dx)
 

@@ -193,7 +193,7 @@ def test_derivatives_of_the_motion_agree_with_sigma_points(estimate):
         buffer.append(float(now), w, np.array([2 * np.sin(8 * now), -9.0, 3.7 + np.cos(5 * now)]))
     segment = buffer.segment(1.0, 1.0987)
     d = layout.dynamic
-    S = np.tril(np.random.default_rng(4).normal(size=(d, d))) * 1e-5
+    S = np.triu(np.random.default_rng(4).normal(size=(d, d))) * 1e-5
     points = move_by_sigma_points(state, layout, S, segment)
     straight = move_by_derivatives(state, layout, S, segment)
     # trapezoids over the nodes for the derivatives by the biases: a thousandth

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.filter.passed import Corrected, Moved, smoothed
+from vical_daemon.estimation.model.unscented import upper_root
 
 IMAGES, SIZE, SECONDS, DRIFTS = 8, 12, 0.3, [(11, 10)]
 
@@ -25,17 +26,17 @@ def test_smoothed_errors_are_those_of_all_images_at_once(system):
     F, Q, ways, by_error, shared, z = system
     mean, P, predicted, run = np.zeros(SIZE), 0.25 * np.eye(SIZE), [], []
     for W, B, C, y in zip(ways, by_error, shared, z, strict=True):
-        L, H = np.linalg.cholesky(P), W @ B
+        L, H = upper_root(np.linalg.cholesky(P)), W @ B
         V = np.eye(5) + W @ C @ C.T @ W.T
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + V)
         predicted.append(mean)
         innovation = y - H @ mean
         mean, P = mean + K @ innovation, P - K @ H @ P
-        after = np.linalg.cholesky(P)
-        moves = np.concatenate([B @ L, C], axis=1)
+        after = upper_root(np.linalg.cholesky(P))
+        moves = np.concatenate([C, B @ L], axis=1)
         run.append(Corrected(L, after, after, W, innovation, moves))
         mean, P = F @ mean, F @ P @ F.T + Q
-        run.append(Moved(after, np.linalg.cholesky(P), F[:9, :9] @ after[:9, :9], SECONDS))
+        run.append(Moved(after, upper_root(np.linalg.cholesky(P)), F[:9] @ after, SECONDS))
     found = np.array(predicted) + smoothed(run[:-1], DRIFTS)
 
     n = SIZE * IMAGES  # least squares over the errors at all images

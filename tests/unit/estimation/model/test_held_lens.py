@@ -71,7 +71,7 @@ class Linear:
         return CalibrationFilter(
             retract(state, self.layout, x),
             self.layout,
-            unscented.root(P),
+            unscented.upper_root(unscented.root(P)),
             ImuNoise(),
             {NAME: CornerNoise(0.5)},
             np.zeros(self.layout.size),

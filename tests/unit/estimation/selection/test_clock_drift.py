@@ -43,7 +43,7 @@ def some_filter(skew, factor=1.0):
         {NAME: camera},
     )
     layout = make_layout({NAME: "radtan"}, fix=frozenset({"intrinsics"}), estimate=frozenset())
-    S = 1e-4 * np.tril(np.random.default_rng(1).normal(size=(layout.size, layout.size)))
+    S = 1e-4 * np.triu(np.random.default_rng(1).normal(size=(layout.size, layout.size)))
     where = layout.cameras[NAME].skew
     S[where] *= 1e-5 / np.linalg.norm(S[where])
     consistency = Consistency()
