@@ -170,7 +170,7 @@ class LinearisedFilter(CalibrationFilter):
         lin = derive(self.state, self.layout, self.rates, image, self.S)
         self.at_reference = lin.z
         z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
-        return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S))
+        return self._with_shared(image, replace(lin, z=z))
 
     def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:  # noqa: ARG002
         """By the reference: it has been adjusted to all images, while the mean may have lost its way."""

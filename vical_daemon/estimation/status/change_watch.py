@@ -210,10 +210,10 @@ class ChangeWatch:
         if index is None:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR))
-        by_stamps = np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s))
-        watch.floor = float(np.hypot(_DRIFT_FLOOR, by_stamps))
         if not watch.due(t_s):
             return Action.NONE
+        by_stamps = np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s))
+        watch.floor = float(np.hypot(_DRIFT_FLOOR, by_stamps))
         variance, walk = float(f.S[index] @ f.S[index]), float(f.walk[index])
         skew, factor = f.state.cameras[camera].skew, f.consistency[camera].factor
         changes = watch.drifts(t_s, skew, variance, factor, walk)
