@@ -30,8 +30,7 @@ class AccelShift:
 
     def take(self, payload: bytes) -> bytes | None:
         """Take the next reading (sensor_msgs/Imu); return one that is complete, or None."""
-        stamp_ns = stamp_of(payload)
-        if not self._readings or stamp_ns is None:
+        if not self._readings or (stamp_ns := stamp_of(payload)) is None:
             return payload
         if stamp_ns - self._newest_ns > _GAP_NS:
             self._held.clear()

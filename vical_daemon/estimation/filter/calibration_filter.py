@@ -183,16 +183,23 @@ class CalibrationFilter:
         return moved, Q
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
-        """Move the rows of the square root, and add the noise."""
-        c, before, S = moved.curved.shape[1], self.S, self.S.copy()
+        """Move the motion's rows of the square root, and add the noise."""
+        c, S = moved.curved.shape[1], self.S.copy()
         S[MOTION] = moved.linear
-        self._drift_shifts(S, moved.seconds)
         noise = self._random_walk(moved.seconds, after=c + 9)
         noise[MOTION, :c] = moved.curved
         noise[MOTION, c : c + 9] = unscented.root(Q)
+        self._propagate(S, noise, moved.linear, moved.seconds)
+
+    def _propagate(self, S: FloatArray, noise: FloatArray, linear: FloatArray, seconds: float) -> None:
+        """Let time shifts drift, in a new square root as well, and add noise to its first rows."""
+        self._drift(S, self.S, seconds)
+        for name, where in self.layout.cameras.items():
+            if where.timeshift is not None and where.skew is not None:
+                self.state.cameras[name].timeshift_s += seconds * self.state.cameras[name].skew
         unscented.grow(S, noise)
+        self.passed.append(Moved(self.S, S, linear, seconds))
         self.S = S
-        self.passed.append(Moved(before, self.S, moved.linear, moved.seconds))
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -421,15 +428,11 @@ class CalibrationFilter:
             size_rows = np.outer(after, before @ self.S[GRAVITY])
             state.gyro_bias, state.accel_bias, state.gravity = b.gyro_bias, b.accel_bias, b.gravity
         new = len(root)  # motion, or all up to gravity
-        walked = self._random_walk(dt)
-        A = np.concatenate([self.S, np.zeros((self.layout.size, walked.shape[1] + new))], axis=1)
-        A[: len(walked), self.layout.size : -new] = walked
-        self._drift_shifts(A, dt)
-        A[:new] = 0.0
-        A[new - len(size_rows) : new, : self.layout.size] = size_rows
-        A[:new, -new:] = root
-        before, self.S = self.S, unscented.upper_root(A)
-        self.passed.append(Moved(before, self.S, np.zeros((9, self.layout.size)), dt))
+        S, noise = self.S.copy(), self._random_walk(dt, after=new, rows=new)
+        S[:new] = noise[:new] = 0.0
+        S[new - len(size_rows) : new] = size_rows
+        noise[:new, :new] = root
+        self._propagate(S, noise, S[MOTION].copy(), dt)
         self.arm_score = None
         state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
@@ -445,25 +448,18 @@ class CalibrationFilter:
         self.S[GRAVITY] = turned @ self.S[GRAVITY]
         self.inflate_covariance(in_doubt)
 
-    def _random_walk(self, dt: float, after: int = 0) -> FloatArray:
-        """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros.
+    def _random_walk(self, dt: float, after: int, rows: int = BIASES.stop) -> FloatArray:
+        """Columns that biases and what else wanders gain in `dt` seconds, after some of zeros, (m, k).
 
-        Of all errors up to the last that wanders, shape (m, k).
+        Of the first errors, at least `rows`, up to the last that wanders.
         """
         drift = self.walk.nonzero()[0]
-        columns = np.zeros((max([BIASES.stop, *drift + 1]), after + 6 + len(drift)))
+        columns = np.zeros((max([BIASES.stop, rows, *drift + 1]), after + 6 + len(drift)))
         noise, root_s = self.imu_noise, math.sqrt(dt)
         columns[GYRO_BIAS, after : after + 3] = (noise.gyro_walk * root_s) * so3.IDENTITY
         columns[ACCEL_BIAS, after + 3 : after + 6] = (noise.accel_walk * root_s) * so3.IDENTITY
         columns[drift, after + 6 + np.arange(len(drift))] = root_s * np.sqrt(self.walk[drift])
         return columns
-
-    def _drift_shifts(self, A: FloatArray, dt: float) -> None:
-        """Let time shifts drift for `dt` seconds: nominal values, and their rows of the square root `A`."""
-        self._drift(A[:, : self.layout.size], self.S, dt)
-        for name, where in self.layout.cameras.items():
-            if where.timeshift is not None and where.skew is not None:
-                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
 
     def _drift(self, A: FloatArray, S: FloatArray, dt: float) -> None:
         """Let errors of time shifts in `A` drift for `dt` seconds by those of the rates in `S`."""
