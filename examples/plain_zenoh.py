@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import sys
-import time
 
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+KEY = "vical/*/calibration/*/pose"
 
 
 def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> int:
@@ -30,9 +31,8 @@ def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> int:
     def show(sample: zenoh.Sample) -> None:
         message = typestore.deserialize_cdr(sample.payload.to_bytes(), POSE)
         p, q = message.pose.pose.position, message.pose.pose.orientation
-        print(
-            f"{sample.key_expr}: p {p.x:.4f} {p.y:.4f} {p.z:.4f} m, q {q.w:.4f} {q.x:.4f} {q.y:.4f} {q.z:.4f}"
-        )
+        p_text = f"{p.x:.4f} {p.y:.4f} {p.z:.4f}"
+        print(f"{sample.key_expr}: p {p_text} m, q {q.w:.4f} {q.x:.4f} {q.y:.4f} {q.z:.4f}", flush=True)
 
     try:
         session = zenoh.open(config)
@@ -41,13 +41,20 @@ def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> int:
         print(f"no bus at {endpoint}; start `vical run -c FILE`, or name its bus: {own}", file=sys.stderr)
         return 1
     with session:
-        for reply in session.get("vical/*/calibration/*/pose"):
+        for reply in session.get(KEY):
             if reply.ok is not None:
                 show(reply.ok)
-        session.declare_subscriber("vical/*/calibration/*/pose", show)
+        samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        session.declare_subscriber(KEY, samples.put)  # zenoh's own threads must not wait, and cannot raise
         while True:
-            time.sleep(1)
+            show(samples.get())
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:2]))
+    try:
+        sys.exit(main(*sys.argv[1:2]))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # nobody reads any more, as after `| head -3`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)

@@ -45,3 +45,5 @@ if __name__ == "__main__":
         main(*sys.argv[1:])
     except BusError as error:
         sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -6,6 +6,7 @@ python examples/watch_async.py [ENDPOINT]
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 
 from vical_daemon import client
@@ -21,7 +22,7 @@ async def main(endpoint: str | None = None) -> int:
             count = 0
             async for update in robot.updates():
                 count += 1
-                print(count, update.estimate.status, f"NIS {update.estimate.nis_per_dof:.2f}")
+                print(count, update.estimate.status, f"NIS {update.estimate.nis_per_dof:.2f}", flush=True)
                 if count == 10:
                     break
     except (BusError, client.ClientError) as error:
@@ -31,4 +32,10 @@ async def main(endpoint: str | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(asyncio.run(main(*sys.argv[1:2])))
+    try:
+        sys.exit(asyncio.run(main(*sys.argv[1:2])))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # nobody reads any more, as after `| head -3`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)

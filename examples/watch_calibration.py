@@ -6,6 +6,7 @@ python examples/watch_calibration.py tls/robot7:7447        # another one; certi
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def main(endpoint: str | None = None) -> int:
                 f"t_imu = t_cam + {known.timeshift_cam_imu_s:.6f} s (sigma {known.timeshift_sigma_s:.1e} s)"
             )
             for update in robot.updates():
-                print(update.camera, update.estimate.status, *update.announcements)
+                print(update.camera, update.estimate.status, *update.announcements, flush=True)
     except (BusError, client.ClientError) as error:
         print(error, file=sys.stderr)
         return 1
@@ -42,4 +43,10 @@ def main(endpoint: str | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:2]))
+    try:
+        sys.exit(main(*sys.argv[1:2]))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # nobody reads any more, as after `| head -3`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)

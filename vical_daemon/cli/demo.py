@@ -116,18 +116,18 @@ def run(args: argparse.Namespace) -> int:
     result = estimate.to_json() | {"status": str(estimate.status), "trace": trace}
     result |= {"cpu_s": time.process_time(), "truth": truth}
     result["recordings"] = sorted(str(path) for path in set(out.rglob("*.mcap")) - before)
-    problem = f"no solution: {estimate.reason or estimate.guidance}"
+    problem, table = f"no solution: {estimate.reason or estimate.guidance}", None
     if CAMERA in estimate.cameras:
         result["cameras"][CAMERA]["resolution"] = list(config.cameras[CAMERA].size)
         table = demo_truth.compare(result, result["truth"], CAMERA)
         result["error"] = demo_truth.as_json(table)
         problem = demo_truth.verdict(result, table)
-        if not args.json:
-            _print_text(result, demo_truth.as_text(table))
     text = json.dumps(result)
-    write_output(out / "result.json", text + "\n")
+    write_output(out / "result.json", text + "\n")  # first: stdout may be closed, as after `| head`
     if args.json:
         print(text)
+    elif table:
+        _print_text(result, demo_truth.as_text(table))
     busy = _busy(result)
     if problem:
         raise CliError(f"the demo failed: {problem}" + (f" ({busy})" if busy else ""))
