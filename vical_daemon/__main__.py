@@ -7,8 +7,8 @@ import sys
 def main() -> int:
     """Run the command line; ^C while modules load, or at the very end, ends the process without a traceback.
 
-    The parent sees SIGINT as the cause, which a shell reports as 130. A ^C that is ignored (a job that a script
-    started with `&`) stays so.
+    The parent sees SIGINT as the cause, which a shell reports as 130. A ^C that is ignored (a job that a
+    script started with `&`) stays so.
     """
     interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if interruptible:

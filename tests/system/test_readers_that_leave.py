@@ -1,4 +1,4 @@
-"""Programs whose reader leaves (`| head -1`) or that get ^C end in silence, with the exit code that a shell expects."""
+"""Programs whose reader leaves (`| head -1`), or that get ^C, end in silence and with the usual exit code."""
 
 from __future__ import annotations
 

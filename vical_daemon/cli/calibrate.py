@@ -40,6 +40,10 @@ exit code: 0 converged; 3 the result is only converging or degenerate (--accept 
 ACCEPT = ("converging", "degenerate")
 CLOCKS = ("common", "apart")
 _UNUSABLE = ("waiting", "initialising", "inconsistent")
+_START_S = 5.0
+"""Images of 3 to 3.5 s (`MIN_SPAN_S`, `_LEAST_S` of the initializers), and what devices send before them."""
+_USUAL_S = (10.0, 30.0)
+"""Seconds of motion until `converged`, as the README says; `python -m benchmarks zoo` measures them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACCEPT) -> None:
@@ -216,18 +220,34 @@ def conclude(
         from vical_daemon.offline.calibration_job import one_alone, suspects
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
-        mistake = outcome.wrong_target or diagnose_input(job)
-        if mistake:
-            mistake += one_alone(job)
-        why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
+        why = outcome.wrong_target or diagnose_input(job)
+        if why:
+            why += one_alone(job)
+        elif result["duration_s"] < _START_S:
+            why = _too_short(args, result)
+        else:
+            why = f"{status}: {result['reason'] or result['guidance'] or 'too little data'} ({suspects(job)})"
+            why = f"{why}; {_too_short(args, result)}".removesuffix("; ")
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")
     if job.accel_late:
         warn(result["warnings"][-1])
     if status == "converged":
         return 0
-    warn(f"{status}: {why}")
+    warn(f"{status}: {why}; {_too_short(args, result)}".removesuffix("; "))
     return 0 if status in accepted else EXIT_NOT_CONVERGED
+
+
+def _too_short(args: argparse.Namespace, result: dict[str, Any]) -> str:
+    """Say so where the data are shorter than those from which a calibration usually converges."""
+    used_s, part = result["duration_s"], args.seconds is not None or args.skip
+    if used_s >= _USUAL_S[0]:
+        return ""
+    more = "use more (--seconds, --skip)" if part else "record more"
+    return (
+        f"{used_s:.1f} s of data are short: a start needs about {_START_S:g} s of images in motion, "
+        f"a result usually {_USUAL_S[0]:g} to {_USUAL_S[1]:g} s; {more}"
+    )
 
 
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:

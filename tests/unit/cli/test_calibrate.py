@@ -140,6 +140,22 @@ def test_the_exit_code_tells_whether_it_converged(
     assert (f"{status}: " in err) == (status != "converged")
 
 
+def test_a_recording_that_is_too_short_says_how_long_it_should_be(
+    shortest: Path, outcome, monkeypatch, capsys
+):
+    assert main(_arguments(shortest, "--seconds", "2")) == 1
+    said = capsys.readouterr().err
+    assert "vical: error: no calibration: 2.0 s of data are short: a start needs about 5 s" in said
+    assert "usually 10 to 30 s; use more (--seconds" in said and "if the motion was rich" not in said
+    changed = replace(outcome, estimate=replace(outcome.estimate, status=Status.CONVERGING, guidance="nod"))
+    monkeypatch.setattr(calibrate, "run_job", lambda *_, **__: changed)
+    assert main(_arguments(shortest)) == 3
+    said = capsys.readouterr().err
+    assert (
+        "warning: converging: " in said and "s of data are short" in said and said.endswith("; record more\n")
+    )
+
+
 def _scale_csv(path: Path, columns: slice, factor: float) -> None:
     rows = [line.split(",") for line in path.read_text().splitlines()]
     for row in rows:
