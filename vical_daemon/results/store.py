@@ -22,7 +22,7 @@ from vical_daemon.bus.messages.poses import rotation_matrix
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
-from vical_daemon.service.atomic_file import atomic_write
+from vical_daemon.service.atomic_file import atomic_write, why_refused
 
 _log = logging.getLogger(__name__)
 _FORMAT = 1
@@ -123,7 +123,7 @@ class CalibrationStore:
         try:
             atomic_write(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
-            raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
+            raise StoreError(f"{path} cannot be written: {why_refused(error)}") from None
         return path
 
     def load(self, imu_serial: str, camera_serial: str) -> StoredCalibration | None:

@@ -38,6 +38,17 @@ def atomic_write(path: Path, data: bytes, *, durable: bool = True) -> None:
     sync_folder(path.parent)
 
 
+def why_refused(error: OSError) -> str:
+    """Say why nothing can be written; below systemd, whose sandbox may be the reason, what to do."""
+    text, own = error.strerror or str(error), os.environ.get("STATE_DIRECTORY")
+    if own and error.errno in (errno.EROFS, errno.EACCES):
+        return (
+            f"{text}; outside of {own} the service needs ReadWritePaths= in its unit, and a folder that "
+            "belongs to its user (docs/service.md, Sandbox)"
+        )
+    return text
+
+
 def sync_folder(folder: Path | int) -> None:
     """Make a rename in a folder survive a power cut, where the file system can do that.
 

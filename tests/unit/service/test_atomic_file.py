@@ -10,7 +10,8 @@ import pytest
 
 from vical_daemon.cli import main
 from vical_daemon.cli.errors import describe_known
-from vical_daemon.service.atomic_file import write_output
+from vical_daemon.logs.mcap import LogError, LogFolder
+from vical_daemon.service.atomic_file import why_refused, write_output
 
 
 @pytest.fixture
@@ -64,3 +65,26 @@ def test_links_are_followed_modes_kept_and_devices_written_to(tmp_path: Path) ->
 def test_names_of_files_that_are_no_text_do_not_stop_a_report(tmp_path: Path) -> None:
     write_output(tmp_path / "r.html", "made from " + os.fsdecode(b"\xff.mcap"))
     assert (tmp_path / "r.html").read_text() == "made from ?.mcap"
+
+
+@pytest.mark.parametrize("code", [errno.EROFS, errno.EACCES])
+def test_what_the_sandbox_of_the_service_refuses_names_the_setting(code: int, monkeypatch) -> None:
+    refused = OSError(code, os.strerror(code), "/data/logs")
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert why_refused(refused) == os.strerror(code)
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/vical")
+    assert why_refused(refused).startswith(
+        f"{os.strerror(code)}; outside of /var/lib/vical the service needs "
+    )
+    assert why_refused(OSError(errno.ENOSPC, "full")) == "full"
+
+
+def test_the_recorder_says_so(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/vical")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(LogError, match=r"cannot record into .*: Read-only file system; .* ReadWritePaths="):
+        LogFolder(tmp_path / "log").lock()

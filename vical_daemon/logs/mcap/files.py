@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from vical_daemon.service.atomic_file import sync_folder
+from vical_daemon.service.atomic_file import sync_folder, why_refused
 
 PART_SUFFIX = ".part"
 
@@ -35,7 +35,7 @@ class LockedFile:
                 self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             except OSError as error:
                 self.close()
-                raise LogError(f"cannot create {path}: {describe(error)}") from None
+                raise LogError(f"cannot create {path}: {why_refused(error)}") from None
             fcntl.flock(self._fd, fcntl.LOCK_EX)
             if os.fstat(self._fd).st_nlink == 0:
                 self.close()

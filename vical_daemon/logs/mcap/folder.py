@@ -13,7 +13,7 @@ from pathlib import Path
 
 from vical_daemon.logs.mcap.files import LogError, describe
 from vical_daemon.logs.mcap.recover import Recovery, recover_folder
-from vical_daemon.service.atomic_file import atomic_write
+from vical_daemon.service.atomic_file import atomic_write, why_refused
 
 _LOCK, _RUNS = ".recorder.lock", ".recorder.runs"
 # Only files of this form are ever deleted: rig_YYYYmmddTHHMMSSZ_run_segment.mcap
@@ -62,7 +62,7 @@ class LogFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             descriptor = _open_lock(self.path / _LOCK)
         except OSError as error:
-            raise LogError(f"cannot record into {self.path}: {describe(error)}") from None
+            raise LogError(f"cannot record into {self.path}: {why_refused(error)}") from None
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
