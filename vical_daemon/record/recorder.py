@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import resource
 import threading
 from importlib.metadata import PackageNotFoundError, version
@@ -40,6 +41,8 @@ _OF_LIMIT = 0.75
 """Share of the largest file that this process may write (`ulimit -f`) after which the next one begins. The
 rest is for what comes before the next look, 0.1 s, an open chunk of 1 MB, index and attachments."""
 _REPORTS = 32  # log lines about malformed messages and unknown commands
+_PASSWORD = re.compile(rb"""(\bpassword["']?[ \t]*:).*(?:\n[ \t]++(?![\w"']+[ \t]*:).*)*""")
+"""The key, and its value with the lines that go on with it."""
 _ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
 
 
@@ -355,9 +358,5 @@ def _latches(topic: Topic) -> bool:
 
 
 def _without_secrets(text: bytes) -> bytes:
-    """Return a config without its passwords, because logs are shared."""
-    lines = [
-        line.split(b"password:")[0] + b"password: removed" if b"password:" in line else line
-        for line in text.splitlines()
-    ]
-    return b"\n".join(lines) + b"\n"
+    """Return a config without its passwords, because logs are shared; whatever way YAML writes the key."""
+    return _PASSWORD.sub(rb"\1 removed", text)

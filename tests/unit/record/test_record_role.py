@@ -391,11 +391,18 @@ def test_a_replaced_device_begins_a_new_file(make, tmp_path):
     assert [dict(r.metadata)["devices"] for r in readers] == [{"imu/imu0": "A"}, {"imu/imu0": "B"}]
 
 
-def test_passwords_stay_out_of_logs(tmp_path):
+@pytest.mark.parametrize(
+    "password",
+    [
+        "  password: geheim",
+        '  "password": geheim',
+        "  password : geheim",
+        "  password: >\n    ge\n    geheim",
+    ],
+)
+def test_passwords_stay_out_of_logs(tmp_path, password):
     path = tmp_path / "vical.yaml"
-    path.write_text(
-        f"rig: rig0\nbus:\n  user: a\n  password: geheim\nrecord: {{directory: {tmp_path / 'log'}}}\n"
-    )
+    path.write_text(f"rig: rig0\nbus:\n{password}\n  user: a\nrecord: {{directory: {tmp_path / 'log'}}}\n")
     from vical_daemon.config.model import load
 
     recorder = Recorder(load(path), LogFolder(tmp_path / "log"), private_clock())
