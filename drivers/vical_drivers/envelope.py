@@ -17,6 +17,8 @@ from itertools import islice
 
 _DELAY_MEMORY = 1000
 """So many samples weigh in the mean delay."""
+_PARTS = 8
+"""Of the memory, each 2.5 s (12 blocks) or longer; of two neighbours the luckiest should touch the line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +175,25 @@ class LowerEnvelope:
         self.sigma_s = self._uncertainty_s(points, spread_s, points[-1][0] - hull[-1][0])
 
     def _spread_s(self, points: list[tuple[float, float]]) -> float:
-        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
-        residuals = sorted(d - self.line(x) for x, d in points)
+        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest).
+
+        Or, where that is more, how far the luckiest of a quarter of the memory lies above that of another:
+        the least delay changes with the load of the computer, and tilts the line.
+        """
+        residuals = [d - self.line(x) for x, d in points]
+        lowest = sorted(residuals)
         # A few points may agree by chance: their number bounds what can be believed.
         believable_s = self._typical_delay_s / math.sqrt(max(1, self._points))
-        return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
+        above_s = 0.0
+        if len(points) >= 2 * _PARTS:
+            begin_s, part_s = points[0][0], (points[-1][0] - points[0][0]) / _PARTS
+            luckiest = [math.inf] * _PARTS
+            for (x, _), residual in zip(points, residuals, strict=True):
+                part = min(int((x - begin_s) / part_s), _PARTS - 1)
+                luckiest[part] = min(luckiest[part], residual)
+            quarters = [pair for pair in map(min, luckiest, luckiest[1:]) if pair < math.inf]
+            above_s = max(quarters) - lowest[0]
+        return max(lowest[len(lowest) // 10] - lowest[0], believable_s, above_s, 1e-6)
 
     def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float, since_s: float) -> float:
         memory_s = max(points[-1][0] - points[0][0] - since_s, self.options.block_s)
