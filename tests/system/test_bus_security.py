@@ -13,9 +13,16 @@ from pathlib import Path
 import pytest
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.messages import decode_string, encode_string
+from vical_daemon.bus.messages import (
+    DiagnosticStatus,
+    Level,
+    decode_string,
+    encode_diagnostics,
+    encode_string,
+)
 from vical_daemon.bus.zenoh_bus import BusError, open_bus
 from vical_daemon.bus.zenoh_commands import CommandJournal
+from vical_daemon.cli import main
 from vical_daemon.cli.bus_access import open_for_roles
 from vical_daemon.config.model import Config
 
@@ -149,6 +156,22 @@ def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path, ca
     journal.close()
     for bus in (robot, router):
         bus.close()
+
+
+def test_vical_command_says_that_a_network_may_drop_it(tmp_path, capsys):
+    port, path = free_port(), tmp_path / "z.sock"
+    router = open_bus(mode="router", socket=path, tcp_port=port)
+    status = encode_diagnostics(1, "record", [DiagnosticStatus(Level.OK, "record", "")])
+    router.publish("vical/rig0/status/record", status)
+    words = commanded(router)
+    assert main(["command", "record-stop", "--connect", f"tcp/127.0.0.1:{port}"]) == 0
+    said = "over tcp, rig0 obeys those whom its bus.commanders names"
+    assert capsys.readouterr().err == f"vical: whether it was obeyed is not known: {said}\n"
+    assert words == []
+    assert main(["command", "record-stop", "--connect", f"unixsock-stream/{path}"]) == 0
+    assert capsys.readouterr().err == ""
+    assert until(lambda: words == ["stop"])
+    router.close()
 
 
 def commanded(bus) -> list[str]:

@@ -265,6 +265,12 @@ class ZenohBus:
         """Whether a client has its router now (it reconnects by itself); always true for a router."""
         return self._is_router or bool(self._session.info.routers_zid())
 
+    @property
+    def protocol(self) -> str:
+        """What this client is connected over, as "tls" or "unixsock-stream"; empty: not connected."""
+        links = self._session.info.links()
+        return str(links[0].dst).partition("/")[0] if links else ""
+
     def mirror_to(self, mirror: Mirror) -> None:
         """Publish every message there as well; closed with the bus."""
         self._mirror = mirror

@@ -72,13 +72,27 @@ def run(args: argparse.Namespace) -> int:
         return 0
     try:
         rig = _rig(bus, args.rig or _rig_of(args.config))
-        answer = send(bus, rig, args.word)
+        rights = _rights(bus, rig)
+        try:
+            answer = send(bus, rig, args.word)
+        except CliError as error:
+            raise CliError(f"{error}{f'; {rights}' if rights else ''}", error.exit_code) from None
     finally:
         bus.close()
     if answer.startswith("not "):
         raise CliError(answer)
+    if rights and args.word not in _ANSWERED:
+        print(f"vical: whether it was obeyed is not known: {rights}", file=sys.stderr)
     print(json.dumps({"rig": rig, "sent": args.word, "answer": answer}) if args.json else answer)
     return 0
+
+
+def _rights(bus: Bus, rig: str) -> str:
+    """Say who may command where the bus drops the commands of others without a word; empty: on its socket."""
+    protocol = getattr(bus, "protocol", "")
+    if not protocol or protocol.startswith("unixsock"):
+        return ""
+    return f"over {protocol}, {rig} obeys those whom its bus.commanders names"
 
 
 def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
