@@ -178,15 +178,21 @@ class Recorder:
             elif self._wanted and now_ns >= self._retry_ns:
                 self._retry_ns = now_ns + _RETRY_NS
                 self._begin(now_ns)
-        except LogError as error:
-            self._fail(str(error))
-        except OSError as error:
-            self._fail(f"cannot record into {self._folder.path}: {describe(error)}")
+        except (LogError, OSError) as error:
+            if self._session is not None and not self._folder.in_place():  # since it was looked for
+                self._leave_folder(now_ns)
+            elif isinstance(error, LogError):
+                self._fail(str(error))
+            else:
+                self._fail(f"cannot record into {self._folder.path}: {describe(error)}")
+
+    def _leave_folder(self, now_ns: int) -> None:
+        self._retry_ns = now_ns  # nothing to wait for
+        self._end(f"{self._folder.path} was moved, deleted or replaced; going on in a new file")
 
     def _continue(self, session: LogSession, now_ns: int) -> None:
         if not self._folder.in_place():
-            self._retry_ns = now_ns  # nothing to wait for
-            self._end(f"{self._folder.path} was moved, deleted or replaced; going on in a new file")
+            self._leave_folder(now_ns)
             return
         session.tick(now_ns)
         self._folder.enforce_quota(session.path, session.segment_bytes)
@@ -195,7 +201,10 @@ class Recorder:
 
     def _begin(self, now_ns: int) -> None:
         if not self._folder.lock():
-            self._problem = f"standing by: another recorder writes into {self._folder.path}"
+            standing_by = f"standing by: another recorder writes into {self._folder.path}"
+            if self._problem != standing_by:
+                _log.warning("%s; recording begins when that one ends", standing_by)
+            self._problem = standing_by
             return
         self._start_recovery()
         self._folder.enforce_quota()

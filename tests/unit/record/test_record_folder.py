@@ -86,6 +86,35 @@ def test_a_folder_that_goes_while_logs_are_recovered_is_reported_once(
     assert sum(r.levelname == "WARNING" for r in caplog.records) == warnings
 
 
+def test_a_folder_that_is_deleted_during_the_look_is_made_again_at_once(recorder, tmp_path, monkeypatch):
+    """`rm -rf` between two looks at the folder: 5 s were not recorded."""
+    feed(recorder, 0, 5)
+    look = LogFolder.in_place
+    looks = iter([True])
+    monkeypatch.setattr(LogFolder, "in_place", lambda folder: next(looks, None) or look(folder))
+    shutil.rmtree(tmp_path / "log")
+    recorder.tick()
+    recorder.tick()
+    assert recorder.recording
+    feed(recorder, 5, 5)
+    recorder.close()
+    assert kept(tmp_path / "log") == [5, 6, 7, 8, 9]
+
+
+def test_a_recorder_that_stands_by_says_so_once(recorder, tmp_path, caplog, monkeypatch):
+    config = loads(f"rig: rig0\nrecord: {{directory: {tmp_path / 'log'}, reserve_bytes: 0}}\n")
+    second = Recorder(config, LogFolder(tmp_path / "log"), private_clock())
+    monkeypatch.setattr("vical_daemon.record.recorder._RETRY_NS", 0)
+    second.tick()
+    second.tick()
+    said = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert len(said) == 1 and said[0].startswith("standing by: another recorder writes into ")
+    recorder.close()
+    second.tick()
+    assert second.recording
+    second.close()
+
+
 def test_a_deleted_folder_is_made_again(recorder, tmp_path):
     feed(recorder, 0, 5)
     shutil.rmtree(tmp_path / "log")
