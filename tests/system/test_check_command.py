@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,27 @@ def test_all_is_well_with_an_emulated_imu(rig, capsys) -> None:
     out = capsys.readouterr().out
     assert "6223-00042" in out and "100.0 Hz" in out and out.rstrip().endswith("all is well")
     assert "checkerboard, 40 points over 0.350 x 0.200 m" in out
+
+
+@pytest.mark.parametrize(
+    ("quota_bytes", "free_bytes", "says"),
+    [
+        (20_000_000_000, 30_000_000_000, ""),
+        (20_000_000_000, 10_500_000_000, "recordings end when they fill 10.0 GB"),
+        (0, 30_500_000_000, "recordings end when they fill 30.0 GB"),
+    ],
+)
+def test_a_disk_that_is_full_before_anything_is_deleted(
+    rig, capsys, monkeypatch, quota_bytes, free_bytes, says
+) -> None:
+    """A robot of weeks: nothing is recorded any more, and nothing had said that it would be so."""
+    usage = shutil.disk_usage("/")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free_bytes))
+    config = Path(rig("/dev/null"))
+    config.write_text(config.read_text().replace("/log}", f"/log, quota_bytes: {quota_bytes}}}"))
+    assert main(["check", "-c", str(config), "--no-devices"]) == 0
+    out = capsys.readouterr().out
+    assert says in out and ("recordings end" in out) == bool(says)
 
 
 def test_json_lists_every_problem(rig, capsys) -> None:

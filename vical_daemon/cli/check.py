@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from vical_daemon.cli.options import add_config, add_json
 if TYPE_CHECKING:
     from vical_drivers.samples import FrameSource, ImuSource
 
-    from vical_daemon.config.model import CameraConfig, Config, ImuConfig
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig, RecordConfig
 
 _IMU_SECONDS = 2.5
 
@@ -150,7 +151,23 @@ def _check_disk(config: Config) -> Finding:
         return Finding(
             "record", text, f"{text}, below record.reserve_bytes ({reserve:.1f} GB): nothing is recorded"
         )
-    return Finding("record", text)
+    return Finding("record", text + _full_before_the_quota(config.record, folder, free))
+
+
+def _full_before_the_quota(record: RecordConfig, folder: Path, free_bytes: int) -> str:
+    """Say that recording will end with a full disk: the quota that deletes old recordings is larger."""
+    from vical_daemon.logs.mcap import LogFolder
+
+    with suppress(OSError):
+        room_bytes = free_bytes - record.reserve_bytes
+        room_bytes += sum(path.stat().st_size for path in LogFolder(folder).segments())
+        if record.enabled and (not record.quota_bytes or room_bytes < record.quota_bytes):
+            quota = f"{record.quota_bytes / 1e9:.1f} GB" if record.quota_bytes else "no limit"
+            return (
+                f"; recordings end when they fill {room_bytes / 1e9:.1f} GB, because old ones are deleted "
+                f"only beyond record.quota_bytes ({quota})"
+            )
+    return ""
 
 
 def _folder(folder: Path) -> tuple[Path, str]:
