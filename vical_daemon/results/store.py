@@ -10,6 +10,7 @@ import hashlib
 import logging
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,7 @@ class CalibrationStore:
         problem = _problem(stored)
         if problem:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
+        _set_aside(path)
         try:
             atomic_write(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
@@ -164,6 +166,11 @@ def read_stored(path: Path) -> StoredCalibration | None:
     except OSError as error:
         _log.warning("%s cannot be read: %s", path, error.strerror)
         return None
+    return _parsed(text, path)
+
+
+def _parsed(text: bytes, path: Path) -> StoredCalibration | None:
+    """Parse what a file holds; None (with a warning) if it is invalid."""
     try:
         stored = msgspec.convert(_without_news(msgspec.json.decode(text)), StoredCalibration)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -174,6 +181,15 @@ def read_stored(path: Path) -> StoredCalibration | None:
         _log.warning("%s is not used: %s", path, problem)
         return None
     return stored
+
+
+def _set_aside(path: Path) -> None:
+    """Keep a file that this version cannot read, as one of a later version, under another name."""
+    with suppress(OSError):  # one that cannot be read now may be a good one
+        if _parsed(read_file(path, _SIZE_LIMIT), path) is None:
+            kept = path.with_name(f"{path.name}.unused")
+            path.replace(kept)
+            _log.warning("it is kept as %s", kept)
 
 
 class _Place(msgspec.Struct):

@@ -169,3 +169,17 @@ def test_the_newest_is_the_one_saved_last_whatever_the_date_was(store):
     assert [s.order for s in store.all()] == [1, 0]
     store.save("a", "old", "cam0", estimate(), 32 * 10**9)
     assert [s.camera_serial for s in store.all()] == ["old", "new"]
+
+
+@pytest.mark.parametrize("text", ['{"format": 2, "of": "a later version"}', "", "{"])
+def test_a_file_that_this_version_cannot_read_is_kept(store, caplog, text):
+    """Back to the older version and forth again: the calibration of the later one was overwritten."""
+    path = store.save("a", "b", "cam0", estimate(), 1)
+    path.write_text(text)
+    assert store.load("a", "b") is None
+    store.save("a", "b", "cam0", estimate(0.3), 2)
+    assert store.load("a", "b").known.T_imu_cam.p_m[0] == 0.3
+    kept = path.with_name(f"{path.name}.unused")
+    assert kept.read_text() == text and str(kept) in caplog.messages[-1]
+    store.save("a", "b", "cam0", estimate(0.4), 3)
+    assert kept.read_text() == text and len(store.all()) == 1
