@@ -165,35 +165,41 @@ class LowerEnvelope:
         points = points[bisect_left(points, hull[0]) :]  # those before are late: they say nothing of jitter
         spread_s = self._spread_s(points)
         # A short memory of jittery points says little about the skew: weigh it against the prior.
-        skew_sigma = 2.0 * spread_s / memory_s if memory_s > 0 else math.inf
-        prior = self.options.skew_prior
-        weight = 1.0 / (1.0 + (skew_sigma / prior) ** 2)
-        bound = self.options.max_skew
+        weight, bound = self._weight(spread_s, memory_s), self.options.max_skew
         self.skew = min(max(slope * weight, -bound), bound)
         self.offset_s = min(d - self.skew * x for x, d in hull)
-        self._skew_sigma = prior * math.sqrt(1.0 - weight)
+        spread_s = max(spread_s, self._least_delay_changes_s(points))
+        self._skew_sigma = self.options.skew_prior * math.sqrt(1.0 - self._weight(spread_s, memory_s))
         self.sigma_s = self._uncertainty_s(points, spread_s, points[-1][0] - hull[-1][0])
 
-    def _spread_s(self, points: list[tuple[float, float]]) -> float:
-        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest).
+    def _weight(self, spread_s: float, memory_s: float) -> float:
+        """Share of the slope of points with this spread in a mean with the prior, which is zero."""
+        if memory_s <= 0:
+            return 0.0
+        return 1.0 / (1.0 + (2.0 * spread_s / memory_s / self.options.skew_prior) ** 2)
 
-        Or, where that is more, how far the luckiest of a quarter of the memory lies above that of another:
-        the least delay changes with the load of the computer, and tilts the line.
-        """
-        residuals = [d - self.line(x) for x, d in points]
-        lowest = sorted(residuals)
+    def _spread_s(self, points: list[tuple[float, float]]) -> float:
+        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
+        residuals = sorted(d - self.line(x) for x, d in points)
         # A few points may agree by chance: their number bounds what can be believed.
         believable_s = self._typical_delay_s / math.sqrt(max(1, self._points))
-        above_s = 0.0
-        if len(points) >= 2 * _PARTS:
-            begin_s, part_s = points[0][0], (points[-1][0] - points[0][0]) / _PARTS
-            luckiest = [math.inf] * _PARTS
-            for (x, _), residual in zip(points, residuals, strict=True):
-                part = min(int((x - begin_s) / part_s), _PARTS - 1)
-                luckiest[part] = min(luckiest[part], residual)
-            quarters = [pair for pair in map(min, luckiest, luckiest[1:]) if pair < math.inf]
-            above_s = max(quarters) - lowest[0]
-        return max(lowest[len(lowest) // 10] - lowest[0], believable_s, above_s, 1e-6)
+        return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
+
+    def _least_delay_changes_s(self, points: list[tuple[float, float]]) -> float:
+        """How far the luckiest of a quarter of the memory lies above that of another, s.
+
+        The least delay changes with the load of the computer, and tilts the line: that is part of its sigma.
+        The line itself stays as it is, since a slope that is not known yet looks the same.
+        """
+        if len(points) < 2 * _PARTS:
+            return 0.0
+        begin_s, part_s = points[0][0], (points[-1][0] - points[0][0]) / _PARTS
+        luckiest = [math.inf] * _PARTS
+        for x, d in points:
+            part = min(int((x - begin_s) / part_s), _PARTS - 1)
+            luckiest[part] = min(luckiest[part], d - self.line(x))
+        quarters = [pair for pair in map(min, luckiest, luckiest[1:]) if pair < math.inf]
+        return max(quarters) - min(luckiest)
 
     def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float, since_s: float) -> float:
         memory_s = max(points[-1][0] - points[0][0] - since_s, self.options.block_s)
