@@ -29,8 +29,8 @@ _WINDOWS = 5
 _INFORMED = 0.02
 """Share of the old variance that the data between must take away in a direction, to say anything about it."""
 _WRONG = 0.1
-"""Share of the old variance by which the difference of two covariances may be wrong, before a move is certain:
-errors that last make both wrong, and their difference is small. [docs/design/target_free.md, "Doubts ..."]"""
+"""Share of the old variance by which the difference of two covariances may be wrong before a move is certain:
+errors that last make both wrong, and their difference is small. [docs/design/target_free.md, "Doubts"]"""
 
 
 def mounting(layout: Layout) -> tuple[int, ...]:
