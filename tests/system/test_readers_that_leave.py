@@ -20,6 +20,11 @@ from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, 
 
 pytestmark = pytest.mark.system
 EXAMPLES = Path(__file__).parents[2] / "examples"
+_INTERRUPTIBLE = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
 PROGRAMS = {
     "plain_zenoh": [str(EXAMPLES / "plain_zenoh.py")],
     "watch_calibration": [str(EXAMPLES / "watch_calibration.py")],
@@ -56,13 +61,24 @@ def _publish(host: Bus, stop: threading.Event) -> None:
         host.publish(topics.POSE.key("rig0", "cam0"), encode_pose(5, "imu", pose))
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_the_reader_leaves_after_a_line(name: str, endpoint: str) -> None:
+def _after_a_line(name: str, endpoint: str) -> subprocess.Popen[str]:
+    """Start a program, with ^C as a shell's user has it, and read its first line."""
+    words = [sys.executable, *PROGRAMS[name], endpoint]
     program = subprocess.Popen(
-        [sys.executable, *PROGRAMS[name], endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", _INTERRUPTIBLE, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert program.stdout is not None
     assert program.stdout.readline()
+    return program
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_reader_leaves_after_a_line(name: str, endpoint: str) -> None:
+    program = _after_a_line(name, endpoint)
+    assert program.stdout is not None
     program.stdout.close()
     try:
         _, said = program.communicate(timeout=30)
@@ -73,11 +89,7 @@ def test_the_reader_leaves_after_a_line(name: str, endpoint: str) -> None:
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_interrupted_after_a_line(name: str, endpoint: str) -> None:
-    program = subprocess.Popen(
-        [sys.executable, *PROGRAMS[name], endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert program.stdout is not None
-    assert program.stdout.readline()
+    program = _after_a_line(name, endpoint)
     program.send_signal(signal.SIGINT)
     try:
         _, said = program.communicate(timeout=30)

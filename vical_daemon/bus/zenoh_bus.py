@@ -96,7 +96,7 @@ def open_bus(
     if tcp_port or listen or connect:
         config["access_control"] = access_rules(commanders, publishers)
     with closed_to_others():
-        return ZenohBus(open_session(config), is_router=True)
+        return ZenohBus(open_session(config, router=True), is_router=True)
 
 
 def _endpoints(

@@ -187,15 +187,15 @@ def free_socket(path: Path) -> None:
     )
 
 
-def open_session(config: dict[str, Any]) -> Any:
-    """Open a session, without shared memory if the process may lock too little.
+def open_session(config: dict[str, Any], *, router: bool = False) -> Any:
+    """Open a session, without shared memory if the process may lock too little; a router says so.
 
     Raises:
         BusError: No router, or too few files that the process may open.
     """
     _allow_files()
     shared = config["transport"]["shared_memory"]["enabled"]
-    if not shared:
+    if router and not shared:
         _warn_of_copies(_LOCKED)
     try:
         return _open(config)
@@ -203,7 +203,8 @@ def open_session(config: dict[str, Any]) -> Any:
         text = str(error)
         if not shared or ("shm" not in text.lower() and "shared memory" not in text.lower()):
             raise BusError(_explain(config, text)) from None
-    _warn_of_copies(_NO_SHM)
+    if router:
+        _warn_of_copies(_NO_SHM)
     config["transport"]["shared_memory"] = {"enabled": False}
     try:
         return _open(config)

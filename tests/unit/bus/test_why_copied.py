@@ -29,6 +29,15 @@ def test_the_line_names_what_is_in_the_way(monkeypatch, caplog, shared, says):
     monkeypatch.setattr(zenoh_session, "_open", opened)
     monkeypatch.setattr(zenoh_session, "can_share_memory", lambda: shared)
     caplog.set_level(logging.INFO)
-    zenoh_session.open_session(zenoh_session.base_config())
+    zenoh_session.open_session(zenoh_session.base_config(router=True), router=True)
     assert says in reason(caplog)
     assert ("ulimit" in reason(caplog)) is not shared
+
+
+def test_a_client_says_nothing_of_it(monkeypatch, caplog):
+    """`vical watch` of an ordinary user had the line each time, and has nothing to do with images."""
+    monkeypatch.setattr(zenoh_session, "_open", lambda config: None)
+    monkeypatch.setattr(zenoh_session, "can_share_memory", lambda: False)
+    caplog.set_level(logging.INFO)
+    zenoh_session.open_session(zenoh_session.base_config())
+    assert not caplog.records

@@ -24,7 +24,11 @@ sys.exit(main())
 """
 
 
-def _run(module: str, words: list[str], before: str = "") -> subprocess.CompletedProcess[str]:
+# a process that a script starts with `&` begins with ^C ignored, and so do its children
+_USUAL = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+
+
+def _run(module: str, words: list[str], before: str = _USUAL) -> subprocess.CompletedProcess[str]:
     program = _PROGRAM.format(module=module, words=words, before=before)
     return subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
