@@ -244,9 +244,12 @@ def _too_short(args: argparse.Namespace, result: dict[str, Any]) -> str:
     if used_s >= _USUAL_S[0]:
         return ""
     more = "use more (--seconds, --skip)" if part else "record more"
+    needed = f"{_USUAL_S[0]:g} to {_USUAL_S[1]:g} s"
+    if result["cameras"]:
+        return f"{used_s:.1f} s of data are short: a result usually needs {needed} of motion; {more}"
     return (
         f"{used_s:.1f} s of data are short: a start needs about {_START_S:g} s of images in motion, "
-        f"a result usually {_USUAL_S[0]:g} to {_USUAL_S[1]:g} s; {more}"
+        f"a result usually {needed}; {more}"
     )
 
 
