@@ -227,14 +227,14 @@ def conclude(
             why = _too_short(args, result)
         else:
             why = f"{status}: {result['reason'] or result['guidance'] or 'too little data'} ({suspects(job)})"
-            why = f"{why}; {_too_short(args, result)}".removesuffix("; ")
+            why = "; ".join(filter(None, [why, _too_short(args, result)]))
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")
     if job.accel_late:
         warn(result["warnings"][-1])
     if status == "converged":
         return 0
-    warn(f"{status}: {why}; {_too_short(args, result)}".removesuffix("; "))
+    warn("; ".join(filter(None, [f"{status}: {why}", _too_short(args, result)])))
     return 0 if status in accepted else EXIT_NOT_CONVERGED
 
 
