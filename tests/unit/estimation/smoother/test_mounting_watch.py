@@ -77,7 +77,7 @@ def test_a_move_is_noticed_after_some_windows(move_m, windows):
 
 
 def test_a_move_within_the_stated_sigmas_is_doubted_but_not_certain():
-    """Three of 42 stretches of EuRoC: 0.9 to 1.3 sigma where the covariances allow for a sixth of one."""
+    """Five of 24 stretches of EuRoC: 0.9 to 1.3 sigma where the covariances allow for a sixth of one."""
     layout = window_layout()
     where = layout.camera
 
